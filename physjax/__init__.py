@@ -1,0 +1,23 @@
+"""Game physics in JAX: describe a scene once, run it under any method, batch it, differentiate it."""
+
+from physjax.physics import forces
+from physjax.scene import Field, Force, Particles, Scene, loads
+from physjax.stepping import methods
+from physjax.stepping.reference import ode_term, reference
+from physjax.stepping.simulate import simulate
+from physjax.trajectory import Trajectory
+
+__all__ = [
+    "Field",
+    "Force",
+    "Particles",
+    "Scene",
+    "Trajectory",
+    "forces",
+    "loads",
+    "methods",
+    "ode_term",
+    "reference",
+    "simulate",
+]
+__version__ = "0.1.0"

@@ -1,0 +1,277 @@
+"""Loads on particles: each force is its formula, with the units of its numbers.
+
+Every number is a scalar or has the shape of the lanes; every vector is `(dim,)` for all lanes or one per lane. All have
+finite values and derivatives at rest and at coincident points.
+"""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.checks import quantity
+from physjax.physics.gravitation import Gravitation
+from physjax.scene import Field, Force, Function, Particles, loads
+from physjax.vectors import dot, norm, over, scale, spin, unit, upward
+
+__all__ = [
+    "Anchor",
+    "Buoyancy",
+    "Constant",
+    "Gravitation",
+    "Gravity",
+    "Kick",
+    "Magnus",
+    "QuadraticDrag",
+    "RotatingFrame",
+    "SphereDrag",
+    "StokesDrag",
+    "independent",
+    "loads",
+]
+
+
+class Gravity(Field):
+    """Weight near the ground: F = m g, down the axis `up` (1: y). The lecture prints g = -9.8; here g > 0 and up is up."""
+
+    g: Float[Array, "..."] = quantity("g", "m/s²", default=9.8)
+    up: int = eqx.field(static=True, default=1)
+
+    def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """-g along the upward axis [m/s²]."""
+        return upward(-self.g, self.up, state.velocity)
+
+    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
+        """m g y [J]."""
+        return mass * self.g * state.position[..., self.up]
+
+
+class Constant(Force):
+    """The same force at all times: F = F₀ [N]."""
+
+    force: Float[Array, "..."] = quantity("force", "N")
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """F₀ [N]."""
+        return over(self.force, state.velocity)
+
+    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
+        """-F₀·x [J]."""
+        return -dot(over(self.force, state.position), state.position)
+
+
+class Kick(Force):
+    """A force for a while, as when a ball is kicked: impulse [N s] = force × duration, from the time `at` [s] on.
+
+    Half the force acts at the two edges, so that steps which meet the edges deliver the whole impulse under every
+    method. A lane whose impulse is zero is not kicked.
+    """
+
+    impulse: Float[Array, "..."] = quantity("impulse", "N s")
+    at: Float[Array, "..."] = quantity("start of the kick", "s")
+    duration: Float[Array, "..."] = quantity("duration of the kick", "s", above=0)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """impulse/duration while the kick lasts [N]."""
+        t = jnp.asarray(t, state.dtype)
+        rounding = 8 * jnp.finfo(state.dtype).eps * (jnp.abs(t) + self.duration)
+        started = 0.5 * (jnp.sign(_snap(t - self.at, rounding)) + 1.0)
+        ended = 0.5 * (jnp.sign(_snap(t - (self.at + self.duration), rounding)) + 1.0)
+        return scale((started - ended) / self.duration, over(self.impulse, state.velocity))
+
+    def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
+        """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole kick."""
+        return self.at, self.at + self.duration
+
+
+class StokesDrag(Force):
+    """Creeping flow past a sphere: F = -b v with b = 6πηr [kg/s], v relative to the wind [m/s].
+
+    The lecture's drag at low velocity.
+    """
+
+    coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+
+    @classmethod
+    def of_sphere(
+        cls, radius: ArrayLike, viscosity: ArrayLike = 1.81e-5, wind: ArrayLike | None = None
+    ) -> "StokesDrag":
+        """The drag of a sphere: b = 6πηr, radius [m], viscosity [Pa s] (air at 20 °C by default)."""
+        return cls(6 * math.pi * viscosity * jnp.asarray(radius), wind)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """-b (v - wind) [N]."""
+        return scale(-self.coefficient, _airspeed(state, self.wind))
+
+
+class QuadraticDrag(Force):
+    """Drag at high velocity: F = -½ρC_dA |v| v, v relative to the wind. The lecture prints it without its minus sign."""
+
+    area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
+    coefficient: Float[Array, "..."] = quantity("drag coefficient C_d", "1", at_least=0)
+    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """-½ρC_dA |v - wind| (v - wind) [N]."""
+        v = _airspeed(state, self.wind)
+        return scale(-0.5 * self.density * self.coefficient * self.area * norm(v), v)
+
+
+class SphereDrag(Force):
+    """Drag of a smooth sphere at any speed below the drag crisis (Reynolds number Re = ρ|v|d/η < 2e5), v relative to the wind.
+
+    F = -3πηd v [1 + 0.15 Re^0.681 + (0.407 Re/24)/(1 + 8710/Re)]: Stokes' law with the correction of P. P. Brown and D.
+    F. Lawler, "Sphere drag and settling velocity revisited", J. Environ. Eng. 129 (2003) 222. Radius [m], density
+    [kg/m³], viscosity [Pa s].
+    """
+
+    radius: Float[Array, "..."] = quantity("radius", "m", above=0)
+    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", above=0, default=1.204)
+    viscosity: Float[Array, "..."] = quantity("viscosity", "Pa s", above=0, default=1.81e-5)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """The corrected Stokes force [N]."""
+        v = _airspeed(state, self.wind)
+        reynolds = jnp.maximum(
+            2 * self.density * self.radius / self.viscosity * norm(v), 1e-30
+        )  # its power has no slope at 0
+        correction = 1 + 0.15 * reynolds**0.681 + (0.407 / 24) * reynolds**2 / (reynolds + 8710)
+        return scale(-6 * math.pi * self.viscosity * self.radius * correction, v)
+
+
+class Magnus(Force):
+    """Lift of a spinning ball: F = ½ρAC_L |v|² ω̂×v̂, at right angles to the flight, so that it does no work.
+
+    `axis` is the direction of the spin, a vector in space, a number (+1 anticlockwise) in the plane; its length is left
+    out.
+    """
+
+    area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
+    coefficient: Float[Array, "..."] = quantity("lift coefficient C_L", "1", at_least=0)
+    axis: Float[Array, "..."] = quantity("spin axis", "1")
+    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """½ρAC_L |v| ω̂×v [N], v relative to the wind."""
+        v = _airspeed(state, self.wind)
+        axis = jnp.sign(self.axis) if v.shape[-1] == 2 else unit(over(self.axis, v))
+        return scale(0.5 * self.density * self.coefficient * self.area * norm(v), spin(axis, v))
+
+
+class Buoyancy(Force):
+    """Archimedes: F = ρ_f V g, upward (the lecture prints a minus sign). V is the volume of fluid displaced.
+
+    Immersed: give `volume` [m³]. A ball that crosses the fluid's surface: give its `radius` [m] and the height
+    `surface` [m] of the fluid; the part below it counts, V = πh²(3r - h)/3 for a submerged depth h.
+    """
+
+    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0)
+    volume: Float[Array, "..."] | None = quantity("volume", "m³", at_least=0, default=None)
+    radius: Float[Array, "..."] | None = quantity("radius", "m", above=0, default=None)
+    surface: Float[Array, "..."] | None = quantity("surface of the fluid", "m", default=None)
+    g: Float[Array, "..."] = quantity("g", "m/s²", default=9.8)
+    up: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        given = (self.volume is not None, self.radius is not None, self.surface is not None)
+        if given not in ((True, False, False), (False, True, True)):
+            raise ValueError(
+                "Buoyancy: expected volume= (immersed), or radius= and surface= (a ball that crosses the surface); got "
+                f"{[n for n, g in zip(('volume', 'radius', 'surface'), given, strict=True) if g] or 'none of them'}."
+            )
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """ρ_f V g along the upward axis [N]."""
+        return upward(self.density * self.g * self.displaced(state), self.up, state.velocity)
+
+    def displaced(self, state: Particles) -> Float[Array, "..."]:
+        """Volume below the surface [m³]."""
+        if self.surface is None:
+            return self.volume
+        h = self._depth(state)
+        return math.pi / 3 * h**2 * (3 * self.radius - h)
+
+    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
+        """Energy of the displaced fluid [J]: minus the work of the buoyant force from the surface (or from y = 0) to here."""
+        y = state.position[..., self.up]
+        if self.surface is None:
+            return -self.density * self.g * self.volume * y
+        h, r = self._depth(state), self.radius
+        below = jnp.maximum(self.surface - r - y, 0.0)  # depth of the top of a ball that is all under
+        return self.density * self.g * math.pi / 3 * (r * h**3 - h**4 / 4 + 4 * r**3 * below)
+
+    def _depth(self, state):
+        return jnp.clip(self.surface - state.position[..., self.up] + self.radius, 0.0, 2 * self.radius)
+
+
+class RotatingFrame(Field):
+    """What a turning frame adds: centrifugal -mω×(ω×r), Coriolis -2mω×v and, where ω changes, Euler's -mω̇×r.
+
+    `omega` [rad/s] is a vector in space, a number (anticlockwise) in the plane; `omega_rate` is its constant rate of
+    change [rad/s²]. Positions are measured from the axis, omega is given at t = 0.
+    """
+
+    omega: Float[Array, "..."] = quantity("omega", "rad/s")
+    omega_rate: Float[Array, "..."] | None = quantity("omega_rate", "rad/s²", default=None)
+
+    def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """-ω×(ω×r) - 2ω×v - ω̇×r [m/s²]."""
+        r, v = state.position, state.velocity
+        omega = self.omega if self.omega_rate is None else self.omega + scale(t, self.omega_rate)
+        inertial = -spin(omega, spin(omega, r) + 2 * v)
+        return inertial if self.omega_rate is None else inertial - spin(self.omega_rate, r)
+
+
+class Anchor(Force):
+    """A spring from a fixed point: F = -k (|d| - L) d̂ - c (v·d̂) d̂, with d = x - point.
+
+    Without a rest length L it pulls in all directions alike, F = -k d - c v: the harmonic oscillator. Stiffness [N/m],
+    damping [kg/s].
+    """
+
+    point: Float[Array, "..."] = quantity("anchor point", "m")
+    stiffness: Float[Array, "..."] = quantity("stiffness", "N/m", at_least=0)
+    rest_length: Float[Array, "..."] | None = quantity("rest length", "m", at_least=0, default=None)
+    damping: Float[Array, "..."] | None = quantity("damping", "kg/s", at_least=0, default=None)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """The pull of the spring [N]."""
+        d = state.position - over(self.point, state.position)
+        if self.rest_length is None:
+            pull = scale(-self.stiffness, d)
+            return pull if self.damping is None else pull - scale(self.damping, state.velocity)
+        along = unit(d)
+        tension = self.stiffness * (norm(d) - self.rest_length)
+        if self.damping is not None:
+            tension = tension + self.damping * dot(state.velocity, along)
+        return scale(-tension, along)
+
+    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
+        """½k(|d| - L)² [J]."""
+        d = state.position - over(self.point, state.position)
+        return 0.5 * self.stiffness * (dot(d, d) if self.rest_length is None else (norm(d) - self.rest_length) ** 2)
+
+
+def independent(force: Callable) -> Function:
+    """Say of a plain function `(t, state, mass) -> newtons` that no lane's force depends on another lane.
+
+    The run then has a status and may have a step for each lane; a bare function counts as coupling.
+    """
+    return Function(force, couples=False)
+
+
+def _airspeed(state: Particles, wind: Array | None) -> Array:
+    """Velocity relative to the air."""
+    return state.velocity if wind is None else state.velocity - over(wind, state.velocity)
+
+
+def _snap(value: Array, rounding: Array) -> Array:
+    """Zero where the value is within rounding of it."""
+    return jnp.where(jnp.abs(value) <= rounding, 0.0, value)

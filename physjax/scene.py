@@ -1,0 +1,263 @@
+"""The nouns: what a scene is made of, and what a force is.
+
+Arrays are shaped `(*lanes, dim)`, the component last. Lanes are independent (ten thousand balls) or coupled (bodies
+that attract each other, a cloth's nodes); a force says which. In a coupled scene the last lane axis counts nodes and
+earlier axes count scenes. A per-lane number is a scalar or has the shape of the lanes. SI units, y up.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from physjax.checks import real_array, real_quantity
+from physjax.vectors import scale
+
+
+class Particles(NamedTuple):
+    """Point masses: position [m] and velocity [m/s], both `(*lanes, dim)`.
+
+    The record knows how Newton's law moves it, so that the methods need no physics: `rate` is its time derivative,
+    `kick` changes the velocity and leaves the position, `drift` moves the position with the velocity it has.
+    """
+
+    position: Float[Array, "*lanes dim"]
+    velocity: Float[Array, "*lanes dim"]
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Shape of the lanes: `()` for a single particle."""
+        return self.position.shape[:-1]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Floating-point type, which every number of the scene follows."""
+        return self.position.dtype
+
+    def rate(self, acceleration: Float[Array, "*lanes dim"]) -> "Particles":
+        """Time derivative: position changes with the velocity, velocity with the acceleration."""
+        return Particles(self.velocity, acceleration)
+
+    def kick(self, rate: "Particles", dt: ArrayLike) -> "Particles":
+        """v += a dt, the position untouched."""
+        return Particles(self.position, self.velocity + scale(dt, rate.velocity))
+
+    def drift(self, dt: ArrayLike) -> "Particles":
+        """x += v dt, the velocity untouched."""
+        return Particles(self.position + scale(dt, self.velocity), self.velocity)
+
+    def held(self, free: Float[Array, "*lanes"]) -> "Particles":
+        """The state with the velocity of held lanes (free = 0) set to zero."""
+        return Particles(self.position, scale(free, self.velocity))
+
+    def checked(self) -> "Particles":
+        """The state as floating-point arrays of one shape and dtype; ValueError or TypeError in plain words otherwise."""
+        state = Particles(real_array("position", self.position), real_array("velocity", self.velocity))
+        x, v = state
+        if x.ndim == 0 or x.shape != v.shape:
+            raise ValueError(
+                f"Particles: got position {x.shape} and velocity {v.shape}, expected the same shape (*lanes, dim): "
+                "component last, e.g. (2,) for one ball in the plane, (10000, 3) for ten thousand in space."
+            )
+        if 0 in x.shape:
+            raise ValueError(f"Particles: got the empty shape {x.shape}, expected at least one lane and one component.")
+        if x.dtype != v.dtype:
+            raise TypeError(
+                f"Particles: got position {x.dtype} and velocity {v.dtype}, expected one dtype. Cast one of them."
+            )
+        for name, array in (("position [m]", x), ("velocity [m/s]", v)):
+            real_quantity(name, array)
+        return Particles(x.astype(x.dtype), v.astype(v.dtype))  # astype makes weakly typed arrays strong
+
+
+class Force(eqx.Module):
+    """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
+
+    `couples` says whether a lane's force depends on other lanes. `t` [s] is a scalar or per lane. A conservative force
+    also gives its `potential(t, state, mass)` [J], shaped like the lanes (a shared energy is halved between its two
+    lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
+    """
+
+    couples: ClassVar[bool] = False
+
+    @abstractmethod
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """Force on each lane [N]."""
+
+
+class Field(Force):
+    """A force proportional to mass, given as an acceleration [m/s²], so that a falling body never looks its mass up."""
+
+    @abstractmethod
+    def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """Acceleration of each lane [m/s²]."""
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """Force on each lane [N]: mass times the acceleration."""
+        return scale(mass, self.acceleration(t, state, mass))
+
+
+class Function(eqx.Module):
+    """A plain function as part of a scene. It counts as coupling its lanes unless it is said to be independent."""
+
+    function: Callable = eqx.field(static=True)
+    couples: bool = eqx.field(static=True, default=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        return self.function(*arguments)
+
+
+class Scene(eqx.Module):
+    """Everything a run needs but the method: state, mass [kg], forces, and a mask of the lanes that are held in place.
+
+    `mass` is a scalar or per lane. `forces` are library forces or any callable `(t, state, mass) -> newtons`. `pinned`
+    is a boolean mask over the lanes. Every number becomes an array of the state's dtype: changing it compiles nothing,
+    and it can be swept and differentiated. Raises ValueError or TypeError for shapes that do not match, numbers that
+    are not finite, and masses <= 0.
+    """
+
+    state: Particles
+    mass: Float[Array, "..."]
+    forces: tuple
+    pinned: Bool[Array, "*lanes"] | None
+
+    def __init__(
+        self,
+        state: Any,
+        mass: Any = 1.0,
+        forces: Any = (),
+        pinned: Any = None,
+    ):
+        if not hasattr(state, "checked"):
+            raise TypeError(
+                f"Scene: got a state of type {type(state).__name__}, expected Particles(position, velocity)."
+            )
+        state = state.checked()
+        lanes, dtype = state.lanes, state.dtype
+        mass = real_quantity("mass [kg]", mass, above=0.0).astype(dtype)
+        if mass.shape not in ((), lanes):
+            raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {lanes}.")
+        if pinned is not None:
+            pinned = jnp.asarray(pinned)
+            if pinned.dtype != bool or pinned.shape != lanes:
+                raise ValueError(
+                    f"pinned: got {pinned.dtype} of shape {pinned.shape}, expected booleans of the lanes' shape {lanes}."
+                )
+            state = state.held(1 - pinned.astype(dtype))
+        self.state = state
+        self.mass = mass
+        self.forces = tuple(_part(force, dtype) for force in _listed(forces))
+        self.pinned = pinned
+
+    @property
+    def couples(self) -> bool:
+        """Whether any force ties lanes together; a force that does not say counts as coupling."""
+        return any(getattr(force, "couples", True) for force in self.forces)
+
+    @property
+    def status_shape(self) -> tuple[int, ...]:
+        """Shape of what is decided once a scene when lanes are coupled, once a lane when not: status and step size."""
+        return self.state.lanes[:-1] if self.couples else self.state.lanes
+
+    def acceleration(self, t: ArrayLike, state: Particles) -> Float[Array, "*lanes dim"]:
+        """Newton's second law, a = ΣF/m [m/s²]; held lanes do not accelerate."""
+        free = None if self.pinned is None else 1 - self.pinned.astype(state.dtype)
+        fields = [_shaped(f, f.acceleration(t, state, self.mass), state) for f in self.forces if isinstance(f, Field)]
+        newtons = [_shaped(f, f(t, state, self.mass), state) for f in self.forces if not isinstance(f, Field)]
+        total = []
+        if fields:
+            total.append(_sum(fields) if free is None else scale(free, _sum(fields)))
+        if newtons:
+            total.append(scale((1.0 if free is None else free) / self.mass, _sum(newtons)))
+        return _sum(total) if total else jnp.zeros_like(state.velocity)
+
+    def rate(self, t: ArrayLike, state: Particles) -> Particles:
+        """Time derivative of the whole state: the right-hand side of the equations of motion."""
+        return state.rate(self.acceleration(t, state))
+
+    def kick(self, state: Particles, rate: Particles, dt: ArrayLike) -> Particles:
+        """Velocities changed by the accelerations in `rate` for a time dt."""
+        return state.kick(rate, dt)
+
+    def drift(self, state: Particles, dt: ArrayLike) -> Particles:
+        """Positions moved by the velocities in `state` for a time dt."""
+        return state.drift(dt)
+
+    def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
+        """The scene a moment later: one step of the method, then each part that remembers advances."""
+        state = method(self, t, self.state, dt)
+        forces = list(self.forces)
+        for i, force in enumerate(forces):
+            if hasattr(force, "advance"):
+                forces[i], state = force.advance(t, dt, state)
+        return eqx.tree_at(lambda scene: (scene.state, scene.forces), self, (state, tuple(forces)))
+
+    def finite(self, state: Particles) -> Bool[Array, "..."]:
+        """Whether the state is finite, per lane, or per scene where lanes are coupled."""
+        status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
+        good = jnp.all(jnp.stack(status), axis=0)
+        return jnp.all(good, axis=-1) if self.couples and good.ndim else good
+
+
+def loads(scene: Scene, t: ArrayLike, state: Particles | None = None, *, per_term: bool = False) -> Any:
+    """Total force on each lane [N] (the lecture's ComputeTotalForce), at `scene.state` unless a state is given.
+
+    Returns an array shaped like the velocity; with `per_term=True` a tuple of such arrays, one for each of
+    `scene.forces`.
+    """
+    state = scene.state if state is None else state
+    terms = tuple(_shaped(force, force(t, state, scene.mass), state) for force in scene.forces)
+    if per_term:
+        return terms
+    return _sum(terms) if terms else jnp.zeros_like(state.velocity)
+
+
+def as_module(function: Callable) -> eqx.Module:
+    """A plain function wrapped so that it can travel in a pytree; modules are returned as they are."""
+    return function if isinstance(function, eqx.Module) else Function(function)
+
+
+def _listed(forces: Any) -> tuple:
+    """The forces as a tuple; a single force given without one is an easy slip and gets an error that says so."""
+    if callable(forces) or not hasattr(forces, "__iter__"):
+        raise TypeError(f"forces: got {type(forces).__name__}, expected a tuple of forces. Write forces=(force,).")
+    return tuple(forces)
+
+
+def _part(force: Any, dtype: np.dtype) -> eqx.Module:
+    """A force as a pytree whose floating-point numbers have the scene's dtype."""
+    if not callable(force):
+        raise TypeError(
+            f"forces: got {type(force).__name__} {force!r}, expected a force: a callable (t, state, mass) -> newtons."
+        )
+    return jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf,
+        as_module(force),
+    )
+
+
+def _sum(terms: Any) -> Array:
+    total, *others = terms
+    for term in others:
+        total = total + term
+    return total
+
+
+def _shaped(force: Any, value: Any, state: Particles) -> Array:
+    """The force's value, if it is shaped like the velocity; seen once, while tracing."""
+    expected = state.velocity
+    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", type(value))
+    if shape == expected.shape and dtype == expected.dtype:
+        return value
+    name = getattr(getattr(force, "function", force), "__name__", type(force).__name__)
+    raise TypeError(
+        f"force {name}: got an array of shape {shape} and dtype {dtype}, expected {expected.shape} and {expected.dtype} "
+        "like the velocity. Build it from state and mass, and keep other numbers Python floats or fields of a module."
+    )

@@ -1,0 +1,1 @@
+"""How a scene moves: methods, the loop that repeats them, and the diffrax bridge."""

@@ -1,0 +1,112 @@
+"""How a state moves through one step: a method is `(system, t, state, dt) -> state`, with its promises above it.
+
+A `system` (every `Scene` is one) offers `rate(t, state)`, the whole right-hand side, and the split form `kick(state,
+rate, dt)` and `drift(state, dt)`. Methods know no physics: any force works under any of them. `t` and `dt` are scalars
+or have the shape of the lanes.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from jax.typing import ArrayLike
+
+from physjax.vectors import scale
+
+METHODS: dict[str, Callable] = {}
+"""Every method by name, in the order of their definition; charts, tests and tables iterate it."""
+
+
+class Promises(NamedTuple):
+    """What a method promises, each measured by the tests.
+
+    `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stable_to`: the largest
+    stable ω·dt on the undamped oscillator. `order_with_drag`: the order once forces depend on velocity, where it
+    differs.
+    """
+
+    order: int
+    evaluations: int
+    stable_to: float
+    order_with_drag: int
+
+
+def promises(
+    *, order: int, evaluations: int, stable_to: float, order_with_drag: int | None = None
+) -> Callable[[Callable], Callable]:
+    """Attach promises to a method (`method.promises`) and enter it in `METHODS`."""
+
+    def attach(method: Callable) -> Callable:
+        method.promises = Promises(order, evaluations, stable_to, order if order_with_drag is None else order_with_drag)
+        METHODS[method.__name__] = method
+        return method
+
+    return attach
+
+
+@promises(order=1, evaluations=1, stable_to=0.0)
+def euler(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    """Explicit Euler: follow the slope at the start. One force a step; gains energy at any step without damping.
+
+    The lecture's EulerStep and its listing `position += velocity*dt; velocity += acceleration*dt`.
+    """
+    return _along(state, system.rate(t, state), dt)
+
+
+@promises(order=1, evaluations=1, stable_to=2.0)
+def semi_implicit_euler(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    """Kick, then drift with the new velocity: one force a step, energy bounded.
+
+    The lecture's `Vel = Vel + Acc*dt; Pos = Pos + Vel*dt`, which it also calls Euler; a different method with different
+    stability.
+    """
+    return system.drift(system.kick(state, system.rate(t, state), dt), dt)
+
+
+@promises(order=2, evaluations=2, stable_to=0.0)
+def midpoint(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    """Follow the slope found half a step ahead: second order; an oscillation grows by √(1 + (ωdt)⁴/4) a step."""
+    half = _along(state, system.rate(t, state), dt / 2)
+    return _along(state, system.rate(t + dt / 2, half), dt)
+
+
+@promises(order=2, evaluations=2, stable_to=2.0)
+def verlet(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    """Velocity Verlet: half a kick, drift, half a kick with the force found there. Second order, energy bounded.
+
+    Forces that depend on velocity see the predicted v + a·dt at the end of the step, which keeps the order at 2.
+    """
+    start = system.rate(t, state)
+    arrived = system.drift(system.kick(state, start, dt / 2), dt)
+    end = system.rate(t + dt, system.kick(arrived, start, dt / 2))
+    return system.kick(arrived, end, dt / 2)
+
+
+@promises(order=2, evaluations=1, stable_to=2.0, order_with_drag=1)
+def leapfrog(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    """Drift half way, kick, drift on: second order for one force a step, the cheapest where forces depend on position alone.
+
+    Forces that depend on velocity see the old one, and the order falls to 1.
+    """
+    half = system.drift(state, dt / 2)
+    return system.drift(system.kick(half, system.rate(t + dt / 2, half), dt), dt / 2)
+
+
+@promises(order=4, evaluations=4, stable_to=2 * math.sqrt(2))
+def rk4(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    """The classical Runge-Kutta method: four slopes, weighted 1 2 2 1. Loses energy near its limit.
+
+    The lecture's RK4Integration.
+    """
+    k1 = system.rate(t, state)
+    k2 = system.rate(t + dt / 2, _along(state, k1, dt / 2))
+    k3 = system.rate(t + dt / 2, _along(state, k2, dt / 2))
+    k4 = system.rate(t + dt, _along(state, k3, dt))
+    slope = jax.tree.map(lambda a, b, c, d: a + 2.0 * b + 2.0 * c + d, k1, k2, k3, k4)
+    return _along(state, slope, dt / 6)
+
+
+def _along(state: Any, slope: Any, dt: ArrayLike) -> Any:
+    """The state moved along a slope: y + dt·k."""
+    return jax.tree.map(lambda y, k: y + scale(dt, k), state, slope)

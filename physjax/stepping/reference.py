@@ -1,0 +1,141 @@
+"""The bridge to diffrax: an independent reference for every scene, and our physics for diffrax's users.
+
+diffrax is imported when first used; it costs a second.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from physjax.checks import real_quantity
+from physjax.scene import Particles, Scene
+from physjax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import diffrax
+
+MAX_STEPS = 1_000_000
+"""Steps after which the reference gives up and says so in `.ok`."""
+
+
+class _VectorField(eqx.Module):
+    """A scene's right-hand side in diffrax's signature; a pytree, so it is differentiable and recompiles for no number."""
+
+    scene: Scene
+
+    def __call__(self, t: ArrayLike, y: Particles, args: Any) -> Particles:
+        return self.scene.rate(t, y)
+
+
+def ode_term(scene: Scene) -> "diffrax.ODETerm":
+    """The scene as a diffrax `ODETerm` over its state, to be used with any diffrax solver: `y0=scene.state`.
+
+    The equations of motion between steps; parts that remember do not advance. Forces that jump at known times (`Kick`)
+    need `ClipStepSizeController(jump_ts=discontinuities(scene))`.
+    """
+    import diffrax
+
+    return diffrax.ODETerm(_VectorField(scene))
+
+
+def discontinuities(scene: Scene) -> Array:
+    """Times [s] at which a force of the scene jumps, sorted: an adaptive solver must stop there."""
+    times = [jnp.ravel(t) for force in scene.forces for t in getattr(force, "discontinuities", tuple)()]
+    return jnp.sort(jnp.concatenate(times)) if times else jnp.zeros(0, scene.state.dtype)
+
+
+def reference(
+    scene: Scene,
+    times: ArrayLike | Sequence[float],
+    *,
+    rtol: float = 1e-10,
+    atol: float = 1e-10,
+    solver: Any = None,
+) -> Trajectory:
+    """The scene at the given times [s] through diffrax, in float64 whatever the scene's dtype: NumPy arrays come back.
+
+    `times` are ascending and >= 0; the scene's state holds at t = 0. Dopri8 unless another diffrax solver is given; the
+    largest error of any component is held below `atol + rtol |y|` a step. A solve that fails returns `.ok` False and
+    non-finite frames. Raises ValueError for bad times or tolerances.
+    """
+    times = np.asarray(times, float)
+    if times.ndim != 1 or not times.size or not np.isfinite(times).all() or times[0] < 0 or (np.diff(times) <= 0).any():
+        raise ValueError("reference: times must be a list of ascending finite numbers >= 0 [s].")
+    real_quantity("rtol", rtol, above=0.0)
+    real_quantity("atol", atol, above=0.0)
+    if any(hasattr(force, "advance") for force in scene.forces):
+        raise ValueError(
+            "reference: the scene has parts that remember, which an ordinary differential equation has not. Remove them."
+        )
+    with jax.enable_x64(True):
+        scene = in_dtype(scene, jnp.float64)
+        end = jnp.asarray(max(times[-1], 1e-300))
+        states, success, _ = solve_ode(
+            scene, jnp.asarray(times), end, jnp.asarray(rtol), jnp.asarray(atol), solver or default_solver()
+        )
+        ok = scene.finite(jax.tree.map(lambda leaf: leaf[-1], states)) & success
+        states, ok = jax.tree.map(np.asarray, (states, ok))
+    return Trajectory(
+        time=times,
+        state=states,
+        parts=(),
+        recorded=None,
+        ok=ok,
+        scene=scene,
+        final_scene=None,
+        stepper=None,
+        dt=None,
+        first_step=np.zeros((), np.int32),
+        save_every=1,
+        steps=times.size - 1,
+    )
+
+
+def default_solver() -> Any:
+    """Dopri8: order 8, the cheapest way to ten digits."""
+    import diffrax
+
+    return diffrax.Dopri8()
+
+
+def in_dtype(scene: Scene, dtype: Any) -> Scene:
+    """The scene with all its floating-point arrays in another dtype; call it inside `jax.enable_x64(True)` for float64."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, scene)
+
+
+@eqx.filter_jit
+def solve_ode(
+    scene: Scene, times: Array, end: Array, rtol: Array, atol: Array, solver: Any
+) -> tuple[Particles, Array, dict]:
+    """diffrax's adaptive solve, forward only: states, success, statistics. Compiles once for all tolerances."""
+    import diffrax
+
+    controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=_largest)
+    jumps = discontinuities(scene)
+    if jumps.size:
+        controller = diffrax.ClipStepSizeController(controller, jump_ts=jumps)
+    solution = diffrax.diffeqsolve(
+        ode_term(scene),
+        solver,
+        t0=jnp.zeros((), times.dtype),
+        t1=end,
+        dt0=None,
+        y0=scene.state,
+        saveat=diffrax.SaveAt(ts=times),
+        stepsize_controller=controller,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=MAX_STEPS,
+        throw=False,
+    )
+    return solution.ys, solution.result == diffrax.RESULTS.successful, solution.stats
+
+
+def _largest(state: Particles) -> Array:
+    """The largest component of a state: no lane may hide behind the others' average."""
+    return jax.tree.reduce(jnp.maximum, jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf)), state))

@@ -1,0 +1,204 @@
+"""The loop: repeat a scene's step, keep frames, count time.
+
+The number of steps is shape (a scan, which can be differentiated); dt and every physical number are not, so changing
+them compiles nothing. Reverse mode keeps the state at the frames and recomputes between them in nested scans: memory
+O(frames + √save_every).
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from physjax.checks import concrete, positive_integer, real_quantity
+from physjax.scene import Scene, as_module
+from physjax.stepping.blocks import Blocks
+from physjax.trajectory import Trajectory, memories
+
+
+def simulate(
+    scene: Scene,
+    method: Callable,
+    *,
+    dt: ArrayLike,
+    steps: int | None = None,
+    duration: float | None = None,
+    save_every: int = 1,
+    record: Callable | None = None,
+    first_step: ArrayLike = 0,
+) -> Trajectory:
+    """Step a scene and keep every `save_every`-th state: compute ten, draw one.
+
+    Give `steps`, or a `duration` [s] that is a multiple of `dt` [s]. `dt` is a scalar or shaped like
+    `scene.status_shape`. Frame 0 is the start. `record=f(t, state)` keeps only that instead of the whole state; name
+    the function once, a new one compiles anew. `first_step` continues the count of time: `simulate(flight.final_scene,
+    ..., first_step=flight.final_step)` resumes a run. Under jit, vmap, jvp and grad as well. Raises ValueError or
+    TypeError for bad numbers; a run that blows up returns with `.ok` False and `.first_bad_step`, it does not raise.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"simulate: got a {type(scene).__name__}, expected a Scene.")
+    if not callable(method):
+        raise TypeError(
+            f"simulate: got the method {method!r}, expected a function (system, t, state, dt) -> state, e.g. methods.rk4."
+        )
+    steps = _checked_steps(steps, duration, dt)
+    dt = _checked_dt(dt, scene)
+    save_every = positive_integer("save_every", save_every)
+    if steps % save_every:
+        raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
+    method = as_module(method)
+    first_step = jnp.asarray(first_step, jnp.int32)
+    return _rollout(scene, method, dt, first_step, steps // save_every, save_every, record)
+
+
+@partial(jax.jit, static_argnames=("frames", "save_every", "record"))
+def _rollout(scene, method, dt, first_step, frames, save_every, record):
+    """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
+    changing = _changing(scene, method, dt)
+    moving, still = eqx.partition(scene, changing)
+    clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
+
+    def step(i, moving, still, dt):
+        scene = eqx.combine(moving, still)
+        return eqx.filter(scene.step(method, time_at(i, dt, scene.state.dtype), dt), changing)
+
+    blocks = Blocks.of(scene, dt, frame_steps=save_every) if record is None else None
+
+    def frame(moving, index):
+        first = first_step + index * save_every
+        if blocks is None:
+            moving = repeat(partial(step, still=still, dt=dt), moving, first, save_every)
+        else:
+            moving = blocks.map(
+                lambda m, s, h: repeat(partial(step, still=s, dt=h), m, first, save_every), moving, still, dt
+            )
+        return moving, moving if record is None else record(clock(first + save_every), eqx.combine(moving, still).state)
+
+    start = moving if blocks is None else blocks.cut(moving)
+    last, kept = lax.scan(frame, start, jnp.arange(frames, dtype=jnp.int32))
+    if blocks is not None:
+        last, kept = blocks.join(last, moving), blocks.join(kept, moving, leading=1)
+    first_kept = moving if record is None else record(clock(first_step), scene.state)
+    kept = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first_kept, kept)
+    film = None if record is not None else eqx.combine(kept, still)
+    final_scene = eqx.combine(last, still)
+    return Trajectory(
+        time=jax.vmap(clock)(first_step + save_every * jnp.arange(frames + 1, dtype=jnp.int32)),
+        state=None if film is None else film.state,
+        parts=() if film is None else memories(film.forces),
+        recorded=None if record is None else kept,
+        ok=scene.finite(final_scene.state),
+        scene=scene,
+        final_scene=final_scene,
+        stepper=method,
+        dt=dt,
+        first_step=first_step,
+        save_every=save_every,
+        steps=frames * save_every,
+    )
+
+
+def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
+    """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
+    if count == 1:
+        return step(first, carry)
+    inner = math.isqrt(count) if count > 16 else count
+    outer, rest = divmod(count, inner)
+
+    def run(carry, first, length):
+        return lax.scan(lambda c, i: (step(first + i, c), None), carry, jnp.arange(length, dtype=jnp.int32))[0]
+
+    if outer == 1 and not rest:
+        return run(carry, first, count)
+    chunk = jax.checkpoint(partial(run, length=inner), prevent_cse=False)
+    carry, _ = lax.scan(lambda c, i: (chunk(c, first + i * inner), None), carry, jnp.arange(outer, dtype=jnp.int32))
+    return run(carry, first + outer * inner, rest) if rest else carry
+
+
+@partial(jax.jit, static_argnames=("frames",))
+def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: ArrayLike, frames: int) -> Any:
+    """States at `frames` + 1 equally spaced times, with a number of steps between them that is data, not shape.
+
+    One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
+    `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
+    """
+    changing = _changing(scene, method, dt)
+    moving, still = eqx.partition(scene, changing)
+
+    def step(i, moving):
+        scene = eqx.combine(moving, still)
+        return eqx.filter(scene.step(method, time_at(i, dt, scene.state.dtype), dt), changing)
+
+    def frame(moving, index):
+        moving = lax.fori_loop(index * steps_per_frame, (index + 1) * steps_per_frame, step, moving)
+        return moving, eqx.combine(moving, still).state
+
+    _, states = lax.scan(frame, moving, jnp.arange(frames, dtype=jnp.int32))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), scene.state, states)
+
+
+def time_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Array:
+    """Time is counted, t = i dt, never accumulated: accumulation drifts by a rounding error a step."""
+    return step.astype(dtype) * dt
+
+
+def _changing(scene: Scene, method: Callable, dt: ArrayLike) -> Any:
+    """Mask over the scene's arrays: the state, and what a step replaced. Found by tracing one step and comparing identities."""
+    mask = []
+
+    def trace(scene):
+        after = scene.step(method, jnp.zeros((), scene.state.dtype), dt)
+        mask.append(jax.tree.map(lambda before, now: before is not now, scene, after))
+        return after
+
+    jax.eval_shape(trace, scene)
+    return eqx.tree_at(lambda scene: scene.state, mask[0], jax.tree.map(lambda _: True, scene.state))
+
+
+def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:
+    dt = real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype)
+    if dt.shape not in ((), scene.status_shape):
+        raise ValueError(
+            f"dt [s]: got shape {dt.shape}, expected () or {scene.status_shape}: one step size per "
+            f"{'scene, since lanes are coupled' if scene.couples else 'lane'}."
+        )
+    return dt
+
+
+def _checked_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> int:
+    """The number of steps, given or counted from the duration; a duration that is no multiple of dt is an error."""
+    if (steps is None) == (duration is None):
+        given = "neither" if steps is None else "both"
+        raise ValueError(f"simulate: got {given} of steps and duration, expected exactly one of them.")
+    if steps is not None:
+        return positive_integer("steps", steps)
+    step, span = (
+        concrete(real_quantity("dt [s]", dt, above=0.0)),
+        concrete(real_quantity("duration [s]", duration, above=0.0)),
+    )
+    if step is None or span is None:
+        raise TypeError(
+            "duration: dt or duration is being traced, so the number of steps is unknown. Give steps= instead."
+        )
+    if span.ndim:
+        raise ValueError(f"duration [s]: got shape {span.shape}, expected one number.")
+    exact = np.asarray(
+        dt
+    )  # before rounding to the state's dtype: a Python 0.01 divides 5 s, the float32 next to it does not
+    counts = float(duration) / exact.astype(float)
+    count = round(counts.flat[0])
+    tolerance = 1e-6 + counts * (np.finfo(exact.dtype).eps if exact.dtype.kind == "f" else 0.0)
+    if count < 1 or np.any(np.abs(counts - count) > tolerance):
+        raise ValueError(
+            f"duration [s]: got {duration:g} with dt {exact.flat[0]:g}, which is {counts.flat[0]:.7g} steps; "
+            "expected a whole number of steps, the same in every lane. Change one of them or give steps=."
+        )
+    return count

@@ -1,0 +1,1 @@
+"""What you ask of a scene: closed forms, accuracy, energy."""

@@ -1,0 +1,195 @@
+"""What a run returns: frames over time, a status per lane, and enough memory of the run to step again inside it."""
+
+import os
+import zipfile
+import zlib
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from physjax.checks import concrete
+from physjax.files import replacing
+from physjax.scene import Function, Particles, Scene, as_module
+
+
+class Trajectory(eqx.Module):
+    """Frames of a run. `.time` [s] is `(frames,)`; `.state` has a leading axis of frames, frame 0 the start.
+
+    `.ok` says whether the state stayed finite, per lane (per scene where lanes are coupled); `.first_bad_step` where it
+    did not. `.parts` are the forces that remember, with the arrays they changed at every frame. `.recorded` replaces
+    `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of the run, from which it
+    can be resumed.
+    """
+
+    time: Float[Array | np.ndarray, "frames *lanes"]
+    state: Any
+    parts: tuple
+    recorded: Any
+    ok: Bool[Array | np.ndarray, "..."]
+    scene: Scene | None
+    final_scene: Scene | None
+    stepper: Any
+    dt: Float[Array, "..."] | None
+    first_step: Int[Array | np.ndarray, ""]
+    save_every: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+
+    @property
+    def position(self) -> Float[Array | np.ndarray, "frames *lanes dim"]:
+        """Positions [m] at the frames."""
+        return self._states().position
+
+    @property
+    def velocity(self) -> Float[Array | np.ndarray, "frames *lanes dim"]:
+        """Velocities [m/s] at the frames."""
+        return self._states().velocity
+
+    @property
+    def method(self) -> Any:
+        """The method that made the run; None when it came from a reference solver."""
+        return self.stepper.function if isinstance(self.stepper, Function) else self.stepper
+
+    @property
+    def final_step(self) -> Int[Array | np.ndarray, ""]:
+        """The count of steps at the end, to resume from."""
+        return self.first_step + self.steps
+
+    @property
+    def first_bad_step(self) -> Int[Array, "..."]:
+        """The first step after which a lane was no longer finite, -1 where `.ok`.
+
+        Watching every step would slow every run, so a run that failed is stepped once more, with a watch, when this is
+        read.
+        """
+        ok = concrete(self.ok)
+        if ok is not None and ok.all():
+            return jnp.full(ok.shape, -1, jnp.int32)
+        if self.scene is None or self.stepper is None:
+            raise ValueError(
+                "first_bad_step: this trajectory does not know its scene and method. Load it with scene= and method=."
+            )
+        return _first_bad_step(self.scene, self.stepper, self.dt, self.first_step, self.steps)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the run as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent.
+
+        Holds time, ok, first_bad_step, dt, steps, save_every, the name of the method, and the arrays of state, parts
+        and recorded, named after their fields. The scene itself is code and stays with you.
+        """
+        arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
+        arrays["method"] = getattr(self.method, "__name__", type(self.method).__name__)
+        if self.stepper is not None:
+            arrays |= {"dt": self.dt, "first_bad_step": self.first_bad_step}
+        for group, tree in self._saved().items():
+            for keys, leaf in jax.tree_util.tree_leaves_with_path(tree):
+                arrays[group + jax.tree_util.keystr(keys)] = leaf
+        with replacing(path, "wb") as file:
+            np.savez_compressed(file, **{name: np.asarray(array) for name, array in arrays.items()})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Any = None) -> "Trajectory":
+        """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
+
+        Without them frames and status are there all the same. What was recorded comes back as an array, or, if it was
+        more than one, as a dict by path. Raises FileNotFoundError, or ValueError for a file that is not a saved run or
+        belongs to another scene.
+        """
+        file = Path(path)
+        if not file.is_file():
+            raise FileNotFoundError(f"load: there is no file {file}. Expected a run written by Trajectory.save.")
+        try:
+            with np.load(file) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+        except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"load: {file} is damaged or not an .npz file ({error}).") from error
+        missing = {"time", "ok", "first_step", "save_every", "steps", "method"} - set(arrays)
+        if missing:
+            raise ValueError(f"load: {file} is not a saved run: it lacks {', '.join(sorted(missing))}.")
+        return _restored(cls, arrays, scene, method)
+
+    def _saved(self) -> dict[str, Any]:
+        """The pytrees that go into a file, by the name they have there."""
+        groups = {"state": self.state, "parts": self.parts, "recorded": self.recorded}
+        if self.final_scene is not None:
+            groups |= {"final_state": self.final_scene.state, "final_parts": memories(self.final_scene.forces)}
+        return groups
+
+    def _states(self) -> Particles:
+        if self.state is None:
+            raise AttributeError(
+                "this trajectory holds .recorded only: simulate was told what to record instead of the state."
+            )
+        return self.state
+
+
+@partial(jax.jit, static_argnames="steps")
+def _first_bad_step(scene, method, dt, first_step, steps):
+    def body(carry):
+        i, scene, found = carry
+        scene = scene.step(method, (first_step + i).astype(scene.state.dtype) * dt, dt)
+        fresh = (found < 0) & ~scene.finite(scene.state)
+        return i + 1, scene, jnp.where(fresh, first_step + i + 1, found)
+
+    def going(carry):
+        i, _, found = carry
+        return (i < steps) & jnp.any(found < 0)
+
+    bad = jnp.full(scene.status_shape, -1, jnp.int32)
+    return lax.while_loop(going, body, (jnp.zeros((), jnp.int32), scene, bad))[2]
+
+
+def memories(forces: tuple) -> tuple:
+    """Those of the forces that remember."""
+    return tuple(force for force in forces if hasattr(force, "advance"))
+
+
+def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
+    """A trajectory from the arrays of a file."""
+    recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
+    state = parts = final_scene = None
+    if scene is not None:
+        final_state = _filled("final_state", scene.state, arrays)
+        final_parts = iter(_filled("final_parts", memories(scene.forces), arrays))
+        forces = tuple(next(final_parts) if hasattr(force, "advance") else force for force in scene.forces)
+        final_scene = eqx.tree_at(lambda s: (s.state, s.forces), scene, (final_state, forces))
+        if final_state.position.shape != scene.state.position.shape:
+            raise ValueError(
+                f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
+                "Give the scene the run was made with."
+            )
+        parts = () if recorded else _filled("parts", memories(scene.forces), arrays)
+    if not recorded:
+        state = _filled("state", Particles(0, 0) if scene is None else scene.state, arrays)
+    return cls(
+        time=jnp.asarray(arrays["time"]),
+        state=state,
+        parts=parts or (),
+        recorded=(recorded.get("", recorded) or None) if recorded else None,
+        ok=jnp.asarray(arrays["ok"]),
+        scene=scene,
+        final_scene=final_scene,
+        stepper=None if method is None else as_module(method),
+        dt=jnp.asarray(arrays["dt"]) if "dt" in arrays else None,
+        first_step=jnp.asarray(arrays["first_step"]),
+        save_every=int(arrays["save_every"]),
+        steps=int(arrays["steps"]),
+    )
+
+
+def _filled(group: str, like: Any, arrays: dict[str, np.ndarray]) -> Any:
+    """The pytree `like` with its leaves replaced by the file's arrays of that group."""
+    leaves, tree = jax.tree_util.tree_flatten_with_path(like)
+    names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise ValueError(
+            f"load: the file lacks {missing[0]!r}, which the scene has. Give the scene the run was made with."
+        )
+    return jax.tree.unflatten(tree, [jnp.asarray(arrays[name]) for name in names])

@@ -1,0 +1,95 @@
+"""Little vectors, component by component.
+
+Vectors live in the last axis of an array shaped `(*lanes, dim)`. Nothing here reduces over that axis: sums are written
+out by components, which XLA fuses into straight-line code (a generic reduction over an axis of length 3 runs 10 to 30
+times slower on CPU). Derivatives are safe where the formulas are not: the norm of a zero vector has derivative zero, to
+any order.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+
+def dot(a: Float[Array, "*lanes dim"], b: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    """Scalar product a·b, shaped like the lanes."""
+    total = a[..., 0] * b[..., 0]
+    for i in range(1, a.shape[-1]):
+        total = total + a[..., i] * b[..., i]
+    return total
+
+
+@jax.custom_jvp
+def norm(v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    """Length |v|, shaped like the lanes; its derivative at v = 0 is zero instead of NaN."""
+    return jnp.sqrt(dot(v, v))
+
+
+@norm.defjvp
+def _norm_jvp(primals, tangents):
+    (v,), (dv,) = primals, tangents
+    return norm(v), dot(unit(v), dv)
+
+
+def _inverse_norm(v):
+    """1/|v| per lane, and zero where v is zero."""
+    length = norm(v)
+    present = length > 0
+    return jnp.where(present, 1.0 / jnp.where(present, length, 1.0), 0.0)
+
+
+@jax.custom_jvp
+def unit(v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    """Direction v/|v|; the zero vector has the direction zero, and derivative zero."""
+    return scale(_inverse_norm(v), v)
+
+
+@unit.defjvp
+def _unit_jvp(primals, tangents):
+    (v,), (dv,) = primals, tangents
+    direction = unit(v)
+    return direction, scale(_inverse_norm(v), dv - scale(dot(direction, dv), direction))
+
+
+def cross(a: Float[Array, "*lanes 3"], b: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    """Vector product a × b in three dimensions."""
+    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return jnp.stack([x, y, z], axis=-1)
+
+
+def turn_left(v: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
+    """The plane's e_z × v: v turned by 90 degrees anticlockwise."""
+    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+
+def spin(omega: Float[Array, "..."], v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    """ω × v: a vector ω, `(3,)` or per lane, in space; a number ω, scalar or per lane, in the plane."""
+    if v.shape[-1] == 2:
+        return scale(omega, turn_left(v))
+    return cross(over(omega, v), v)
+
+
+def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Product of a per-lane (or per-scene) number with an array: `number` is a scalar or has the leading axes of `array`."""
+    number = jnp.asarray(number)
+    if number.ndim == 0:
+        return number * array
+    return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
+
+
+def over(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    """One vector `(dim,)` for all lanes, or one per lane, broadcast to the shape of `like`."""
+    return vector if vector.shape == like.shape else jnp.broadcast_to(vector, like.shape)
+
+
+def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    """A vector along axis `up` with the given amount, scalar or per lane, shaped like `like`."""
+    amount = jnp.asarray(amount)
+    axis = np.eye(like.shape[-1])[up].astype(like.dtype)
+    if amount.ndim == 0:
+        return jnp.broadcast_to(amount * axis, like.shape)
+    return scale(amount, jnp.broadcast_to(axis, like.shape))

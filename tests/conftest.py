@@ -1,0 +1,44 @@
+"""Tests run in float64 with strict dtype and rank promotion, and with every shape annotation of physjax executed.
+
+`precision` runs a test twice: in float64, and in float32 with 64-bit types off, which is what games run in.
+"""
+
+import os
+from typing import NamedTuple
+
+# one thread per worker: the workers fill the cores, and threads that spin for each other double the time of the suite
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import jaxtyping
+import pytest
+
+with jaxtyping.install_import_hook("physjax", "beartype.beartype"):
+    import physjax  # noqa: F401
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+class Precision(NamedTuple):
+    """A floating-point type and the distance from 1 to the next number in it."""
+
+    dtype: jax.numpy.dtype
+    eps: float
+
+
+@pytest.fixture(params=["float64", "float32"])
+def precision(request):
+    with jax.enable_x64(request.param == "float64"):
+        dtype = jax.numpy.dtype(request.param)
+        yield Precision(dtype, float(jax.numpy.finfo(dtype).eps))
+
+
+@pytest.fixture
+def unannotated():
+    """Switch the executed annotations off, so that bad input reaches the checks that users meet."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
