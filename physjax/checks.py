@@ -72,10 +72,16 @@ def real_quantity(
 def quantity(
     name: str, unit: str, *, above: int | float | None = None, at_least: int | float | None = None, **options: Any
 ) -> Any:
-    """A dataclass field for a physical number: an array leaf, checked when the module is built; None (absent) passes through."""
+    """A dataclass field for a physical number: an array leaf, checked when the module is built.
+
+    Where the default is None, None means absent and passes through.
+    """
+    optional = options.get("default", 0.0) is None
 
     def convert(value):
-        return None if value is None else real_quantity(f"{name} [{unit}]", value, above=above, at_least=at_least)
+        if value is None and optional:
+            return None
+        return real_quantity(f"{name} [{unit}]", value, above=above, at_least=at_least)
 
     return eqx.field(converter=convert, metadata={"unit": unit}, **options)
 

@@ -82,6 +82,7 @@ class Force(eqx.Module):
     `couples` says whether a lane's force depends on other lanes. `t` [s] is a scalar or per lane. A conservative force
     also gives its `potential(t, state, mass)` [J], shaped like the lanes (a shared energy is halved between its two
     lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
+    One that jumps in time has `during(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
     """
 
     couples: ClassVar[bool] = False
@@ -190,9 +191,14 @@ class Scene(eqx.Module):
         """Positions moved by the velocities in `state` for a time dt."""
         return state.drift(dt)
 
+    def during(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
+        """The scene as one step sees it: forces that jump in time replaced by their mean over the step."""
+        forces = tuple(f.during(t, dt, self.state) if hasattr(f, "during") else f for f in self.forces)
+        return eqx.tree_at(lambda scene: scene.forces, self, forces)
+
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: one step of the method, then each part that remembers advances."""
-        state = method(self, t, self.state, dt)
+        state = method(self.during(t, dt), t, self.state, dt)
         forces = list(self.forces)
         for i, force in enumerate(forces):
             if hasattr(force, "advance"):
@@ -233,7 +239,7 @@ def _listed(forces: Any) -> tuple:
 
 def _part(force: Any, dtype: np.dtype) -> eqx.Module:
     """A force as a pytree whose floating-point numbers have the scene's dtype."""
-    if not callable(force):
+    if not callable(force) or isinstance(force, type):
         raise TypeError(
             f"forces: got {type(force).__name__} {force!r}, expected a force: a callable (t, state, mass) -> newtons."
         )

@@ -75,7 +75,10 @@ class Trajectory(eqx.Module):
             raise ValueError(
                 "first_bad_step: this trajectory does not know its scene and method. Load it with scene= and method=."
             )
-        return _first_bad_step(self.scene, self.stepper, self.dt, self.first_step, self.steps)
+        watch = partial(_first_bad_step, steps=self.steps)
+        for _ in range(self.first_step.ndim):  # runs that came out of vmap
+            watch = jax.vmap(watch)
+        return watch(self.scene, self.stepper, self.dt, self.first_step)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the run as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent.
@@ -85,8 +88,10 @@ class Trajectory(eqx.Module):
         """
         arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
         arrays["method"] = getattr(self.method, "__name__", type(self.method).__name__)
-        if self.stepper is not None:
-            arrays |= {"dt": self.dt, "first_bad_step": self.first_bad_step}
+        if self.dt is not None:
+            arrays["dt"] = self.dt
+        if self.scene is not None and self.stepper is not None:
+            arrays["first_bad_step"] = self.first_bad_step
         for group, tree in self._saved().items():
             for keys, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 arrays[group + jax.tree_util.keystr(keys)] = leaf
@@ -107,7 +112,7 @@ class Trajectory(eqx.Module):
         try:
             with np.load(file) as archive:
                 arrays = {name: archive[name] for name in archive.files}
-        except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        except (ValueError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(f"load: {file} is damaged or not an .npz file ({error}).") from error
         missing = {"time", "ok", "first_step", "save_every", "steps", "method"} - set(arrays)
         if missing:
@@ -151,10 +156,13 @@ def memories(forces: tuple) -> tuple:
 
 
 def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
-    """A trajectory from the arrays of a file."""
+    """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
+    ours = "dt" in arrays
+    del arrays["method"]  # a name, for those who read the file with NumPy
+    arrays = {name: jnp.asarray(array) if ours else array for name, array in arrays.items()}
     recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
     state = parts = final_scene = None
-    if scene is not None:
+    if scene is not None and ours:
         final_state = _filled("final_state", scene.state, arrays)
         final_parts = iter(_filled("final_parts", memories(scene.forces), arrays))
         forces = tuple(next(final_parts) if hasattr(force, "advance") else force for force in scene.forces)
@@ -168,22 +176,22 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
     if not recorded:
         state = _filled("state", Particles(0, 0) if scene is None else scene.state, arrays)
     return cls(
-        time=jnp.asarray(arrays["time"]),
+        time=arrays["time"],
         state=state,
         parts=parts or (),
-        recorded=(recorded.get("", recorded) or None) if recorded else None,
-        ok=jnp.asarray(arrays["ok"]),
+        recorded=recorded.get("", recorded) if recorded else None,
+        ok=arrays["ok"],
         scene=scene,
         final_scene=final_scene,
         stepper=None if method is None else as_module(method),
-        dt=jnp.asarray(arrays["dt"]) if "dt" in arrays else None,
-        first_step=jnp.asarray(arrays["first_step"]),
+        dt=arrays.get("dt"),
+        first_step=arrays["first_step"],
         save_every=int(arrays["save_every"]),
         steps=int(arrays["steps"]),
     )
 
 
-def _filled(group: str, like: Any, arrays: dict[str, np.ndarray]) -> Any:
+def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray]) -> Any:
     """The pytree `like` with its leaves replaced by the file's arrays of that group."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]
@@ -192,4 +200,4 @@ def _filled(group: str, like: Any, arrays: dict[str, np.ndarray]) -> Any:
         raise ValueError(
             f"load: the file lacks {missing[0]!r}, which the scene has. Give the scene the run was made with."
         )
-    return jax.tree.unflatten(tree, [jnp.asarray(arrays[name]) for name in names])
+    return jax.tree.unflatten(tree, [arrays[name] for name in names])

@@ -82,14 +82,28 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
 
 
 def over(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-    """One vector `(dim,)` for all lanes, or one per lane, broadcast to the shape of `like`."""
-    return vector if vector.shape == like.shape else jnp.broadcast_to(vector, like.shape)
+    """One vector `(dim,)` for all lanes, or one per lane, broadcast to the shape of `like`.
+
+    Raises ValueError for a number, or a vector of another length: broadcast, it would point somewhere unmeant.
+    """
+    if vector.shape[-1:] != like.shape[-1:]:
+        raise ValueError(
+            f"got a vector of shape {vector.shape}, expected {like.shape[-1:]} for all lanes or {like.shape}, one per lane."
+        )
+    return jnp.broadcast_to(vector, like.shape)
 
 
 def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-    """A vector along axis `up` with the given amount, scalar or per lane, shaped like `like`."""
-    amount = jnp.asarray(amount)
-    axis = np.eye(like.shape[-1])[up].astype(like.dtype)
+    """A vector along axis `up` with the given amount, scalar or per lane, shaped like `like`.
+
+    Raises ValueError where there is no such axis.
+    """
+    amount, dim = jnp.asarray(amount), like.shape[-1]
+    if not 0 <= up < dim:
+        raise ValueError(
+            f"up: got axis {up}, but vectors here have {dim} components. Give an axis from 0 to {dim - 1}."
+        )
+    axis = np.eye(dim)[up].astype(like.dtype)
     if amount.ndim == 0:
         return jnp.broadcast_to(amount * axis, like.shape)
     return scale(amount, jnp.broadcast_to(axis, like.shape))

@@ -66,8 +66,8 @@ class Constant(Force):
 class Kick(Force):
     """A force for a while, as when a ball is kicked: impulse [N s] = force × duration, from the time `at` [s] on.
 
-    Half the force acts at the two edges, so that steps which meet the edges deliver the whole impulse under every
-    method. A lane whose impulse is zero is not kicked.
+    A step feels its mean over the step, so that the whole impulse arrives under every method and at every step size.
+    A lane whose impulse is zero is not kicked.
     """
 
     impulse: Float[Array, "..."] = quantity("impulse", "N s")
@@ -76,11 +76,15 @@ class Kick(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """impulse/duration while the kick lasts [N]."""
-        t = jnp.asarray(t, state.dtype)
-        rounding = 8 * jnp.finfo(state.dtype).eps * (jnp.abs(t) + self.duration)
-        started = 0.5 * (jnp.sign(_snap(t - self.at, rounding)) + 1.0)
-        ended = 0.5 * (jnp.sign(_snap(t - (self.at + self.duration), rounding)) + 1.0)
-        return scale((started - ended) / self.duration, over(self.impulse, state.velocity))
+        t = _per_lane(t, state)
+        lasts = (self.at <= t) & (t < self.at + self.duration)
+        return scale(jnp.where(lasts, 1 / self.duration, 0.0), over(self.impulse, state.velocity))
+
+    def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> Constant:
+        """The mean of the force over the step from t to t + dt."""
+        t, dt = _per_lane(t, state), _per_lane(dt, state)
+        share = _share_before(self.at + self.duration, t, dt) - _share_before(self.at, t, dt)
+        return Constant(scale(share / self.duration, over(self.impulse, state.velocity)))
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
         """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole kick."""
@@ -138,9 +142,8 @@ class SphereDrag(Force):
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The corrected Stokes force [N]."""
         v = _airspeed(state, self.wind)
-        reynolds = jnp.maximum(
-            2 * self.density * self.radius / self.viscosity * norm(v), 1e-30
-        )  # its power has no slope at 0
+        reynolds = 2 * self.density * self.radius / self.viscosity * norm(v)
+        reynolds = jnp.maximum(reynolds, 1e-24)  # its power has no slope at 0; two derivatives still fit in float32
         correction = 1 + 0.15 * reynolds**0.681 + (0.407 / 24) * reynolds**2 / (reynolds + 8710)
         return scale(-6 * math.pi * self.viscosity * self.radius * correction, v)
 
@@ -195,20 +198,20 @@ class Buoyancy(Force):
         """Volume below the surface [m³]."""
         if self.surface is None:
             return self.volume
-        h = self._depth(state)
+        h = jnp.minimum(self._depth(state), 2 * self.radius)
         return math.pi / 3 * h**2 * (3 * self.radius - h)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
         """Energy of the displaced fluid [J]: minus the work of the buoyant force from the surface (or from y = 0) to here."""
-        y = state.position[..., self.up]
         if self.surface is None:
-            return -self.density * self.g * self.volume * y
-        h, r = self._depth(state), self.radius
-        below = jnp.maximum(self.surface - r - y, 0.0)  # depth of the top of a ball that is all under
-        return self.density * self.g * math.pi / 3 * (r * h**3 - h**4 / 4 + 4 * r**3 * below)
+            return -self.density * self.g * self.volume * state.position[..., self.up]
+        depth, r = self._depth(state), self.radius
+        h = jnp.minimum(depth, 2 * r)
+        return self.density * self.g * math.pi / 3 * (r * h**3 - h**4 / 4 + 4 * r**3 * (depth - h))
 
     def _depth(self, state):
-        return jnp.clip(self.surface - state.position[..., self.up] + self.radius, 0.0, 2 * self.radius)
+        """Depth of the ball's lowest point."""
+        return jnp.maximum(self.surface - state.position[..., self.up] + self.radius, 0.0)
 
 
 class RotatingFrame(Field):
@@ -224,9 +227,11 @@ class RotatingFrame(Field):
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-ω×(ω×r) - 2ω×v - ω̇×r [m/s²]."""
         r, v = state.position, state.velocity
-        omega = self.omega if self.omega_rate is None else self.omega + scale(t, self.omega_rate)
-        inertial = -spin(omega, spin(omega, r) + 2 * v)
-        return inertial if self.omega_rate is None else inertial - spin(self.omega_rate, r)
+        if self.omega_rate is None:
+            return -spin(self.omega, spin(self.omega, r) + 2 * v)
+        rate = _turning(self.omega_rate, r)
+        omega = _turning(self.omega, r) + scale(t, rate)
+        return -spin(omega, spin(omega, r) + 2 * v) - spin(rate, r)
 
 
 class Anchor(Force):
@@ -272,6 +277,20 @@ def _airspeed(state: Particles, wind: Array | None) -> Array:
     return state.velocity if wind is None else state.velocity - over(wind, state.velocity)
 
 
-def _snap(value: Array, rounding: Array) -> Array:
-    """Zero where the value is within rounding of it."""
-    return jnp.where(jnp.abs(value) <= rounding, 0.0, value)
+def _turning(omega: Array, r: Array) -> Array:
+    """An angular velocity for every lane: a number in the plane, a vector in space."""
+    return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else over(omega, r)
+
+
+def _per_lane(number: ArrayLike, state: Particles) -> Array:
+    """A number that every lane has in common, or the lanes of a scene, so that it meets numbers shaped like the lanes."""
+    number = jnp.asarray(number, state.dtype)
+    return number.reshape(number.shape + (1,) * (len(state.lanes) - number.ndim)) if number.ndim else number
+
+
+def _share_before(edge: Array, t: Array, dt: Array) -> Array:
+    """The share of the step from t to t + dt that lies before a time; exactly 0 or 1 if it is one of the step's ends."""
+    share = (edge - t) / dt
+    whole = jnp.round(share)
+    rounding = 4 * jnp.finfo(share.dtype).eps * (1 + jnp.abs(t) / dt)
+    return jnp.clip(jnp.where(jnp.abs(share - whole) <= rounding, whole, share), 0.0, 1.0)

@@ -38,7 +38,7 @@ class Gravitation(Field):
         def pull(total, sources, strength):
             offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
             near = self._near(offsets)
-            weight = (strength[..., None, :] * near) * (near * near)
+            weight = strength[..., None, :] * near * near * near  # in this order float32 reaches Pluto in SI units
             return [a + jnp.sum(weight * d, axis=-1) for a, d in zip(total, offsets, strict=True)]
 
         return jnp.stack(_over_tiles(pull, [jnp.zeros_like(c) for c in targets], targets, gm), axis=-1)
@@ -69,7 +69,7 @@ class Gravitation(Field):
         square = jnp.where(apart, square, 1.0)
         if self.softening is not None:
             square = square + self.softening * self.softening
-        return jnp.where(apart, lax.rsqrt(square), 0.0)
+        return jnp.where(apart, 1.0 / jnp.sqrt(square), 0.0)  # rsqrt's derivative passes 1/d³, which underflows
 
 
 def _components(x: Array) -> list[Array]:
@@ -77,16 +77,17 @@ def _components(x: Array) -> list[Array]:
 
 
 def _over_tiles(add, total, sources: list[Array], strength: Array):
-    """Fold `add(total, sources, strength)` over tiles of the last axis; the last is filled up with sources of no strength."""
+    """Fold `add(total, sources, strength)` over tiles of the last axis; copies of the last source, of no strength, fill it up."""
     count = strength.shape[-1]
     if count <= TILE:
         return add(total, sources, strength)
     missing = -count % TILE
 
-    def tiles(a):
-        filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)])
+    def tiles(a, **fill):
+        filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)], **fill)
         return jnp.moveaxis(filled.reshape((*a.shape[:-1], -1, TILE)), -2, 0)
 
     # recomputing a tile in reverse mode keeps its memory linear too
     body = jax.checkpoint(lambda total, tile: (add(total, *tile), None), prevent_cse=False)
-    return lax.scan(body, total, ([tiles(c) for c in sources], tiles(strength)))[0]
+    # a filler elsewhere, at the origin say, could come so close to a body that its 0/d³ is NaN
+    return lax.scan(body, total, ([tiles(c, mode="edge") for c in sources], tiles(strength)))[0]

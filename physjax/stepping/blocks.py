@@ -30,23 +30,23 @@ class Blocks(NamedTuple):
     count: int
 
     @classmethod
-    def of(cls, scene: Scene, dt: Any, frame_steps: int) -> "Blocks | None":
+    def of(cls, scene: Scene, moving: Any, frame_steps: int) -> "Blocks | None":
         """The blocks for a scene, or None where they would not pay or could change its meaning.
 
         Lanes that are coupled stay together, and so do those of a plain function, which may hold arrays that cannot be
-        cut.
+        cut, and those that share something that changes: `moving` are the arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)
         whole = scene.couples or any(isinstance(force, Function) for force in scene.forces)
         if whole or total < SMALLEST or frame_steps < FEWEST_STEPS or jax.default_backend() != "cpu":
             return None
         count = math.ceil(total / BLOCK)
-        return cls(scene.state.lanes, math.ceil(total / count), count)
+        blocks = cls(scene.state.lanes, math.ceil(total / count), count)
+        return blocks if all(map(blocks.is_cut, jax.tree.leaves(moving))) else None
 
     def is_cut(self, leaf: Any) -> bool:
-        """Whether an array has an entry (or a vector) for each lane."""
-        n = len(self.lanes)
-        return hasattr(leaf, "shape") and leaf.shape[:n] == self.lanes and leaf.ndim <= n + 1
+        """Whether an array has an entry (a number, a vector, a matrix) for each lane."""
+        return hasattr(leaf, "shape") and leaf.shape[: len(self.lanes)] == self.lanes
 
     def cut(self, tree: Any) -> Any:
         """Per-lane arrays as `(count, size, ...)`, other leaves as they are."""

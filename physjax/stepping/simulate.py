@@ -18,7 +18,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.checks import concrete, positive_integer, real_quantity
+from physjax.checks import positive_integer, real_quantity
 from physjax.scene import Scene, as_module
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
@@ -49,6 +49,10 @@ def simulate(
         raise TypeError(
             f"simulate: got the method {method!r}, expected a function (system, t, state, dt) -> state, e.g. methods.rk4."
         )
+    if record is not None and not callable(record):
+        raise TypeError(f"record: got {record!r}, expected a function (t, state) -> what to keep.")
+    if not jnp.issubdtype(jnp.result_type(first_step), jnp.integer):
+        raise TypeError(f"first_step: got {first_step!r}, expected an integer, e.g. flight.final_step.")
     steps = _checked_steps(steps, duration, dt)
     dt = _checked_dt(dt, scene)
     save_every = positive_integer("save_every", save_every)
@@ -70,7 +74,7 @@ def _rollout(scene, method, dt, first_step, frames, save_every, record):
         scene = eqx.combine(moving, still)
         return eqx.filter(scene.step(method, time_at(i, dt, scene.state.dtype), dt), changing)
 
-    blocks = Blocks.of(scene, dt, frame_steps=save_every) if record is None else None
+    blocks = Blocks.of(scene, moving, frame_steps=save_every) if record is None else None
 
     def frame(moving, index):
         first = first_step + index * save_every
@@ -180,25 +184,24 @@ def _checked_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> 
         raise ValueError(f"simulate: got {given} of steps and duration, expected exactly one of them.")
     if steps is not None:
         return positive_integer("steps", steps)
-    step, span = (
-        concrete(real_quantity("dt [s]", dt, above=0.0)),
-        concrete(real_quantity("duration [s]", duration, above=0.0)),
-    )
-    if step is None or span is None:
+    if isinstance(dt, jax.core.Tracer) or isinstance(duration, jax.core.Tracer):
         raise TypeError(
             "duration: dt or duration is being traced, so the number of steps is unknown. Give steps= instead."
         )
+    with jax.ensure_compile_time_eval():  # a number stays a number inside jit
+        real_quantity("dt [s]", dt, above=0.0)
+        span = real_quantity("duration [s]", duration, above=0.0)
     if span.ndim:
         raise ValueError(f"duration [s]: got shape {span.shape}, expected one number.")
-    exact = np.asarray(
-        dt
-    )  # before rounding to the state's dtype: a Python 0.01 divides 5 s, the float32 next to it does not
-    counts = float(duration) / exact.astype(float)
+    # before rounding to the state's dtype: a Python 0.01 divides 5 s, the float32 next to it does not
+    exact, span = np.asarray(dt), np.asarray(duration)
+    counts = span.astype(float) / exact.astype(float)
     count = round(counts.flat[0])
-    tolerance = 1e-6 + counts * (np.finfo(exact.dtype).eps if exact.dtype.kind == "f" else 0.0)
+    rounding = max(np.finfo(number.dtype).eps if number.dtype.kind == "f" else 0.0 for number in (exact, span))
+    tolerance = 1e-6 + counts * rounding
     if count < 1 or np.any(np.abs(counts - count) > tolerance):
         raise ValueError(
-            f"duration [s]: got {duration:g} with dt {exact.flat[0]:g}, which is {counts.flat[0]:.7g} steps; "
+            f"duration [s]: got {span:g} with dt {exact.flat[0]:g}, which is {counts.flat[0]:.7g} steps; "
             "expected a whole number of steps, the same in every lane. Change one of them or give steps=."
         )
     return count
