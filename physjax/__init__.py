@@ -2,9 +2,11 @@
 
 from physjax.physics import forces
 from physjax.scene import Field, Force, Particles, Scene, loads
+from physjax.show import plot
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
 from physjax.stepping.simulate import simulate
+from physjax.study import accuracy, energy, projectile
 from physjax.trajectory import Trajectory
 
 __all__ = [
@@ -13,10 +15,14 @@ __all__ = [
     "Particles",
     "Scene",
     "Trajectory",
+    "accuracy",
+    "energy",
     "forces",
     "loads",
     "methods",
     "ode_term",
+    "plot",
+    "projectile",
     "reference",
     "simulate",
 ]

@@ -1,0 +1,115 @@
+"""`physjax` on the command line."""
+
+import argparse
+import io
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns 0, or 2 with one plain line on standard error for bad input."""
+    parser = argparse.ArgumentParser(prog="physjax", description="Game physics in JAX.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    chart = commands.add_parser("chart", help="chart speed against accuracy for the scenes of the gallery")
+    chart.add_argument("scenes", nargs="*", metavar="SCENE", help="names from `physjax scenes`; all by default")
+    chart.add_argument(
+        "--out", default="chart", metavar="DIR", help="where pictures, CSV and the page go (default: chart)"
+    )
+    chart.add_argument("--quick", action="store_true", help="coarser and faster")
+    chart.set_defaults(run=lambda options: _chart(options.scenes, options.out, options.quick))
+
+    scenes = commands.add_parser("scenes", help="list the scenes of the gallery")
+    scenes.set_defaults(run=lambda options: _scenes())
+
+    options = parser.parse_args(arguments)
+    try:
+        options.run(options)
+    except (ValueError, OSError) as error:
+        print(f"physjax: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _scenes() -> None:
+    """Print every scene with its one-line description."""
+    from physjax.scenes import SCENES, title
+    from physjax.show.report import table
+
+    print(table(["scene", "what it is"], [[name, title(name)] for name in SCENES], align="<<"))
+
+
+def _chart(names: list[str], out: str, quick: bool) -> None:
+    """Study the scenes one by one; write PNG, CSV and one HTML page, print one table."""
+    import matplotlib
+
+    from physjax.checks import known
+    from physjax.files import replacing, writable_folder
+    from physjax.scenes import SCENES
+    from physjax.show import report
+
+    names = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(SCENES)
+    folder = writable_folder(out)
+    matplotlib.use("Agg")
+    results = [_study(name, folder, quick) for name in names]
+    summary = _summary([result for result, _ in results])
+    with replacing(folder / "index.html") as file:
+        file.write(report.page("physjax: speed against accuracy", summary, [section for _, section in results]))
+    print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
+    print(f"Measured on {report.machine()}.\nCharts: {folder / 'index.html'}")
+
+
+def _study(name: str, folder: Path, quick: bool):
+    """One scene: its work-precision study, with PNG and CSV written; the result and its section of the page."""
+    import jax
+    from matplotlib import pyplot as plt
+
+    from physjax.files import replacing
+    from physjax.scenes import SCENES, title
+    from physjax.show.report import Section
+    from physjax.stepping.methods import METHODS
+    from physjax.study import accuracy
+
+    with jax.enable_x64(True):
+        problem = SCENES[name]()
+    rivals = accuracy.default_rivals()
+    with tqdm(total=1 + len(METHODS) + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
+
+        def progress(what: str) -> None:
+            bar.set_postfix_str(what)
+            bar.update()
+
+        budget = accuracy.QUICK if quick else accuracy.THOROUGH
+        result = accuracy.work_precision(problem, rivals=rivals, budget=budget, name=name, progress=progress)
+        bar.set_postfix_str("done")
+    figure = result.plot()
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=110)
+    plt.close(figure)
+    with replacing(folder / f"{name}.png", "wb") as file:
+        file.write(picture.getvalue())
+    result.to_csv(folder / f"{name}.csv")
+    return result, Section(name, title(name), picture.getvalue(), result.table())
+
+
+def _summary(results: list) -> str:
+    """A line for each scene: the fastest method, its step and time, for each of the errors."""
+    from physjax.show.report import table
+    from physjax.study.work_precision import ERRORS
+
+    headers = ["scene", *(f"error {error:.0e}" for error in ERRORS), "truth"]
+    rows = [[r.name, *(_fastest(r, error) for error in ERRORS), r.truth] for r in results]
+    return table(headers, rows, align="<" * len(headers))
+
+
+def _fastest(result, error: float) -> str:
+    from physjax.show.report import seconds_text
+
+    run = result.fastest(error)
+    if run is None:
+        return "none within the budget"
+    how = f"dt {seconds_text(run.dt)}" if run.dt is not None else f"tol {run.tolerance:.0e}"
+    return f"{run.method}, {how}: {seconds_text(run.seconds)}"

@@ -1,0 +1,11 @@
+"""The gallery: each scene is one decorated function that carries its own truth. A new file in this folder is found by itself."""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from physjax.scenes.gallery import SCENES, scene, title
+
+for _module in iter_modules(__path__):
+    import_module(f"{__name__}.{_module.name}")
+
+__all__ = ["SCENES", "scene", "title"]

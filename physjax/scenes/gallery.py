@@ -1,0 +1,30 @@
+"""The registry of scenes: a scene enters it by its decorator, wherever in this folder it stands."""
+
+from collections.abc import Callable
+from importlib import resources
+
+import numpy as np
+
+from physjax.study.problem import Problem
+
+SCENES: dict[str, Callable[..., Problem]] = {}
+"""Every scene by name: a function that builds its `Problem`, in the float type of the moment (`jax.enable_x64`)."""
+
+
+def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
+    """Enter a function that builds a problem in the gallery, under its own name; the first line of its docstring describes it."""
+    SCENES[build.__name__] = build
+    return build
+
+
+def title(name: str) -> str:
+    """One line about a scene."""
+    return SCENES[name].__doc__.strip().splitlines()[0]
+
+
+def table(file: str) -> dict[str, np.ndarray]:
+    """A CSV file of measurements that is shipped with the package, column by column."""
+    path = resources.files("physjax.scenes") / "data" / file
+    with path.open(encoding="utf-8") as lines:
+        rows = np.genfromtxt(lines, delimiter=",", names=True, dtype=None, encoding="utf-8")
+    return {name: rows[name] for name in rows.dtype.names}

@@ -1,0 +1,155 @@
+"""Results draw themselves: one call, units on every axis, the same colour for the same method everywhere.
+
+Every function returns matplotlib axes or a figure and accepts one to draw into. matplotlib is imported when first used.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from physjax.show.report import seconds_text
+from physjax.stepping.methods import METHODS
+from physjax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from physjax.study.work_precision import Run, WorkPrecision
+
+PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
+"""Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""
+MARKERS = "osD^vPX*"
+RIVALS = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
+MOST_LANES = 200
+"""Paths drawn of a scene with more lanes than this; the eye tells no more apart."""
+
+
+def style(method: str) -> dict[str, Any]:
+    """Line style of a method: colour and marker by its place in the registry; rivals are grey and dashed."""
+    if method in METHODS:
+        place = list(METHODS).index(method)
+        return {
+            "color": PALETTE[place % len(PALETTE)],
+            "marker": MARKERS[place % len(MARKERS)],
+            "linestyle": "-",
+            "linewidth": 1.5,
+            "markersize": 4.5,
+        }
+    color, line = RIVALS.get(method, ("0.4", ":"))
+    return {"color": color, "marker": ".", "linestyle": line, "linewidth": 1.2, "markersize": 5}
+
+
+def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None, ax: Any = None) -> Any:
+    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three.
+
+    `every` draws one lane in so many; `color` colours lanes by a value each. Returns the axes.
+    """
+    position = np.asarray(flight.position)
+    return _paths(
+        np.asarray(flight.time), position.reshape(position.shape[0], -1, position.shape[-1]), every, color, ax
+    )
+
+
+def _paths(time: np.ndarray, position: np.ndarray, every: int, color: Any, ax: Any) -> Any:
+    """Lines through `(frames, lanes, dim)` positions."""
+    from matplotlib import colormaps
+    from matplotlib import pyplot as plt
+
+    dim = position.shape[-1]
+    position = position[:, ::every]
+    if ax is None:
+        ax = plt.figure(figsize=(6, 4), layout="constrained").add_subplot(projection="3d" if dim == 3 else None)
+    count = position.shape[1]
+    shade = np.arange(count) if color is None else np.asarray(color).ravel()[::every]
+    span = np.ptp(shade) or 1.0
+    colours = colormaps["viridis"]((shade - shade.min()) / span * 0.9)
+    for lane in range(count):
+        track = position[:, lane]
+        line = (time, track[:, 0]) if dim == 1 else track.T
+        ax.plot(*line, color=colours[lane], linewidth=1.2, alpha=1.0 if count < 60 else 0.6)
+        if dim > 1:
+            ax.plot(*track[-1:].T, color=colours[lane], marker="o", markersize=3.5)
+    if dim == 1:
+        ax.set(xlabel="time [s]", ylabel="position [m]")
+    else:
+        ax.set(xlabel="x [m]", ylabel="y [m]")
+        ax.set_aspect("equal", adjustable="datalim")
+        if dim == 3:
+            ax.set_zlabel("z [m]")
+    return ax
+
+
+def work_precision(result: "WorkPrecision", figure: Any = None) -> Any:
+    """Four panels of a work-precision study: path, error against time, error against step, drift (or evaluations).
+
+    Runs that failed stand as crosses on the upper edge, where they died. Returns the figure.
+    """
+    from matplotlib import pyplot as plt
+
+    figure = figure or plt.figure(figsize=(11, 9))
+    panels = figure.subplots(
+        2, 2, gridspec_kw={"left": 0.08, "right": 0.98, "top": 0.92, "bottom": 0.17, "wspace": 0.22, "hspace": 0.3}
+    )
+    figure.suptitle(f"{result.name.replace('_', ' ')}: {seconds_text(result.duration)}, {result.dtype}", fontsize=14)
+    time, position = result.path
+    seen = position.reshape(position.shape[0], -1, position.shape[-1])[..., :2]  # space is seen from above
+    _paths(time, seen, math.ceil(seen.shape[1] / MOST_LANES), None, panels[0, 0]).set_title(
+        f"the path ({result.truth})", fontsize=11
+    )
+
+    ax = panels[0, 1]
+    _curves(ax, result, "seconds", "path_error")
+    ax.set(xlabel="run time [s]", ylabel="largest error on the path [path extent]")
+    ax.set_title("speed against accuracy: lower left is better", fontsize=11)
+
+    ax = panels[1, 0]
+    _curves(ax, result, "dt", "path_error")
+    ax.set(xlabel="step dt [s]", ylabel="largest error on the path [path extent]")
+    ax.set_title("order: the slope of each line", fontsize=11)
+
+    ax = panels[1, 1]
+    if result.conserved:
+        _curves(ax, result, "dt", "drift")
+        ax.set(xlabel="step dt [s]", ylabel=f"largest change of the {result.conserved[0]} [relative]")
+        ax.set_title(f"what must be kept: {result.conserved[0]}", fontsize=11)
+    else:
+        _curves(ax, result, "evaluations", "path_error")
+        ax.set(xlabel="force evaluations", ylabel="largest error on the path [path extent]")
+        ax.set_title("the same on any machine: error against evaluations", fontsize=11)
+    handles = {method: plt.Line2D([], [], **style(method), label=_legend(result, method)) for method in result.methods}
+    handles["failed"] = plt.Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
+    figure.legend(handles=list(handles.values()), loc="lower center", ncols=3, fontsize=9.5, frameon=False)
+    return figure
+
+
+def _curves(ax: Any, result: "WorkPrecision", x: str, y: str) -> None:
+    """A line for each method through the runs that held, and crosses on the upper edge for those that failed."""
+    for method in result.methods:
+        runs = [run for run in result.of(method) if getattr(run, x) is not None]
+        good = [run for run in runs if run.status == "ok"]
+        line = style(method)
+        ax.plot([getattr(run, x) for run in good], [max(_value(run, y), 1e-17) for run in good], **line)
+        failed = [getattr(run, x) for run in runs if run.status != "ok"]
+        edge = ax.get_xaxis_transform()
+        ax.plot(failed, [0.975] * len(failed), "x", color=line["color"], transform=edge, markersize=6, clip_on=False)
+    if result.floor and y == "path_error":
+        ax.axhline(result.floor, color="0.5", linestyle=":", linewidth=1)
+        ax.annotate(
+            "error of the reference", (0.02, result.floor), xycoords=ax.get_yaxis_transform(), fontsize=8, va="bottom"
+        )
+    ax.set(xscale="log", yscale="log")
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(max(bottom, 1e-17), max(top, 1.0) * 4)
+    ax.grid(which="major", color="0.9")
+
+
+def _value(run: "Run", y: str) -> float:
+    return run.drifts[0] if y == "drift" else getattr(run, y)
+
+
+def _legend(result: "WorkPrecision", method: str) -> str:
+    if method not in result.promised:
+        return f"{method} (adaptive)"
+    order = result.observed_order(method)
+    seen = "exact" if math.isinf(order) else "order unseen" if math.isnan(order) else f"order {order:.2f}"
+    return f"{method}: {seen} (promised {result.promised[method]:.0f})"

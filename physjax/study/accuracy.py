@@ -1,0 +1,317 @@
+"""Speed against accuracy: how wrong is a run, what does it cost, and which method is cheapest for an error you can bear?
+
+Everything is computed in float64 unless another dtype is asked for, errors are measured in positions, relative to how
+far the reference moves, and a run that fails is kept and marked, never dropped.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from physjax.checks import real_quantity
+from physjax.scene import Particles, Scene, as_module
+from physjax.stepping.methods import METHODS
+from physjax.stepping.reference import default_solver, in_dtype, reference, solve_ode
+from physjax.stepping.simulate import sample
+from physjax.study.energy import Conserved
+from physjax.study.problem import Problem
+from physjax.study.work_precision import Run, WorkPrecision
+from physjax.vectors import scale
+
+TOLERANCES = tuple(10.0**-k for k in range(2, 13))
+"""Tolerances at which the adaptive rivals run."""
+
+DETAIL = 12
+"""Moments of the reference path for every one at which errors are measured."""
+
+
+class Budget(NamedTuple):
+    """How long a study may take: refine a step until one run costs `seconds`, time each run `repeats` times."""
+
+    seconds: float = 0.05
+    repeats: int = 5
+    refinement: float = 1.5
+
+
+THOROUGH = Budget()
+"""Step sizes half an order apart, each timed well."""
+QUICK = Budget(seconds=0.01, repeats=2, refinement=2.0)
+"""A look in a few seconds."""
+
+
+def work_precision(
+    problem: Problem | Scene,
+    methods: Sequence[Callable] | None = None,
+    dts: ArrayLike | None = None,
+    *,
+    duration: float | None = None,
+    exact: Callable | None = None,
+    conserved: Sequence[Conserved] = (),
+    rivals: Sequence[Any] | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
+    dtype: Any = np.float64,
+    budget: Budget = THOROUGH,
+    name: str = "scene",
+    progress: Callable[[str], None] = lambda what: None,
+) -> WorkPrecision:
+    """Run a scene under many methods and step sizes, and set error against cost.
+
+    `problem` is a gallery problem, or a scene with its `duration` [s] and, if known, its closed form `exact(times)`.
+    `methods`: all of the registry by default. `dts` [s]: from coarse to fine within the budget by default; each is
+    rounded so that a whole number of steps fits between the moments compared. `rivals`: diffrax solvers, run adaptively
+    at the `tolerances`; Tsit5 and Dopri8 by default. The truth is the closed form where there is one, else diffrax's
+    Dopri8 at 1e-13, whose own error is the floor of the result. Compiles once per method. `progress(what)` is called
+    before each method. Raises ValueError for a missing duration or bad steps.
+    """
+    problem = _as_problem(problem, duration, exact, conserved)
+    methods = list(METHODS.values()) if methods is None else list(methods)
+    if dts is not None:
+        dts = np.atleast_1d(np.asarray(real_quantity("dts [s]", dts, above=0.0), float))
+    with jax.enable_x64(True):
+        scene = in_dtype(problem.scene, dtype)
+        progress("reference")
+        path, floor, source = _truth(problem)
+        truth = jax.tree.map(lambda leaf: leaf[::DETAIL], path)
+        measure = _Errors(problem, scene, truth)
+        runs = []
+        for method in methods:
+            progress(_name(method))
+            runs += _method_runs(problem, scene, method, dts, measure, budget)
+        for solver in default_rivals() if rivals is None else rivals:
+            progress(f"diffrax {type(solver).__name__}")
+            runs += _rival_runs(problem, scene, solver, tolerances, measure, budget)
+    velocity_dependent = _depends_on_velocity(problem.scene)
+    return WorkPrecision(
+        name=name,
+        runs=tuple(runs),
+        promised={_name(m): _promised_order(m, velocity_dependent) for m in methods},
+        truth=source,
+        floor=floor,
+        duration=problem.duration,
+        conserved=tuple(quantity.name for quantity in problem.conserved),
+        dtype=np.dtype(dtype).name,
+        path=(_detailed(problem), path.position),
+        couples=problem.scene.couples,
+    )
+
+
+class _Errors:
+    """Errors of a run against the truth, relative to the extent of the path, the worst lane and moment."""
+
+    def __init__(self, problem: Problem, scene: Scene, truth: Particles):
+        lanes = tuple(range(1, truth.position.ndim - 1))
+        away = np.sqrt(np.sum((truth.position - truth.position[0]) ** 2, axis=-1))
+        nodes = (0, -1) if scene.couples else (0,)
+        extent = away.max(axis=nodes, keepdims=True)[0]
+        self.extent = np.where(extent > 0, extent, 1.0)
+        self.truth, self.lanes = truth, lanes
+        self.conserved = problem.conserved
+        self.drift = jax.jit(partial(_drifts, quantities=problem.conserved))
+        self.scene, self.times = scene, jnp.asarray(problem.times)
+
+    def __call__(self, states: Particles) -> tuple[float, float, tuple[float, ...]]:
+        """Final error, path error, and the relative drift of each conserved quantity."""
+        off = np.asarray(states.position, float) - self.truth.position
+        with np.errstate(invalid="ignore", over="ignore"):
+            error = np.sqrt(np.sum(off**2, axis=-1)) / self.extent
+        drifts = tuple(float(d) for d in self.drift(self.scene, self.times, states))
+        return float(error[-1].max()), float(error.max()), drifts
+
+
+def _drifts(scene: Scene, times: Any, states: Particles, quantities: tuple[Conserved, ...]) -> list:
+    """Largest change of each conserved quantity over the path, relative to its size."""
+    over_time = lambda f: jax.vmap(lambda t, state: f(scene, t, state))(times, states)  # noqa: E731
+    drifts = []
+    for quantity in quantities:
+        value, size = over_time(quantity.value), jnp.max(over_time(quantity.size), axis=0)
+        change = jnp.max(jnp.abs(value - value[:1]), axis=0)
+        drifts.append(jnp.max(scale(1 / size, change)))
+    return drifts
+
+
+def _truth(problem: Problem) -> tuple[Particles, float, str]:
+    """The true path in detail, the error it has itself (relative; 0 for a closed form), and where it comes from."""
+    times = _detailed(problem)
+    if problem.exact is not None:
+        return problem.exact(times), 0.0, "closed form"
+    size = _smallest_size(problem.scene)
+    tolerance = {"rtol": 1e-13, "atol": 1e-13 * size}
+    path = reference(problem.scene, times, **tolerance)
+    # the same tolerance with longer steps, which need not land on the moments between: the difference is their error
+    other = reference(problem.scene, problem.times, **tolerance)
+    extent = np.abs(path.position - path.position[0]).max()
+    floor = np.abs(path.position[::DETAIL] - other.position).max() / extent
+    return path.state, float(floor), "diffrax Dopri8, tolerance 1e-13"
+
+
+def _detailed(problem: Problem) -> np.ndarray:
+    """The problem's times and more between them, so that a picture of the path has no corners."""
+    return np.linspace(0.0, problem.duration, problem.frames * DETAIL + 1)
+
+
+def _method_runs(problem, scene, method, dts, measure, budget):
+    """One method from coarse to fine: one compilation, then runs until the budget or rounding ends the refinement."""
+    dt = jnp.asarray(problem.duration / problem.frames, scene.state.dtype)
+    module = as_module(method)
+    started = time.perf_counter()
+    compiled = sample.lower(scene, module, dt, jnp.asarray(1), frames=problem.frames).compile()
+    compile_seconds = time.perf_counter() - started
+    evaluations = _evaluations(method, scene)
+    runs = []
+    for count in _counts(problem, dts, budget):
+        h = jnp.asarray(problem.duration / (problem.frames * count), scene.state.dtype)
+        states, seconds = _timed(partial(compiled, scene, module, h, jnp.asarray(count)), budget)
+        steps = count * problem.frames
+        final, path, drifts = measure(states)
+        runs.append(
+            Run(
+                _name(method),
+                float(h),
+                None,
+                steps,
+                evaluations * steps,
+                *seconds,
+                compile_seconds,
+                final,
+                path,
+                drifts,
+            )
+        )
+        if dts is None and (seconds[0] > budget.seconds or _at_rounding(runs)):
+            break
+    return runs
+
+
+def _rival_runs(problem, scene, solver, tolerances, measure, budget):
+    """A diffrax solver with adaptive steps, from loose to tight tolerance; one compilation."""
+    size = _smallest_size(scene)
+    times = jnp.asarray(problem.times, scene.state.dtype)
+    arguments = lambda tol: (scene, times, times[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
+    started = time.perf_counter()
+    compiled = solve_ode.lower(*arguments(1e-3)).compile()
+    compile_seconds = time.perf_counter() - started
+    stages = solver.tableau.num_stages - (1 if solver.tableau.fsal else 0)
+    name = f"diffrax {type(solver).__name__}"
+    runs = []
+    for tol in tolerances:
+        (states, success, stats), seconds = _timed(partial(compiled, *arguments(tol)), budget)
+        final, path, drifts = measure(states)
+        steps = int(stats["num_steps"])
+        if not success:
+            final = path = float("nan")
+        runs.append(Run(name, None, tol, steps, stages * steps + 1, *seconds, compile_seconds, final, path, drifts))
+        if success and seconds[0] > budget.seconds:
+            break
+    return runs
+
+
+def _timed(run, budget):
+    """The result of a run, and the least and the median of its times [s]; the first counts only where it is long."""
+    times = []
+    for _ in range(budget.repeats + 1):
+        started = time.perf_counter()
+        result = jax.block_until_ready(run())
+        times.append(time.perf_counter() - started)
+        if times[-1] > 2 * budget.seconds:
+            break
+    times = times[1:] or times
+    return result, (min(times), float(np.median(times)))
+
+
+def _counts(problem, dts, budget):
+    """Numbers of steps between two frames, from coarse to fine, without repeats."""
+    if dts is not None:
+        spacing = problem.duration / problem.frames
+        return sorted({max(1, round(spacing / dt)) for dt in dts})
+    counts = np.unique(np.round(budget.refinement ** np.arange(0, 60)).astype(int))
+    return [int(c) for c in counts if c < 10**8]
+
+
+def _at_rounding(runs):
+    """Whether the last two refinements no longer reduced the error: rounding has taken over."""
+    errors = [run.path_error for run in runs[-3:]]
+    return len(errors) == 3 and max(errors) < 1e-7 and errors[1] > 0.9 * errors[0] and errors[2] > 0.9 * errors[1]
+
+
+def _as_problem(problem, duration, exact, conserved):
+    if isinstance(problem, Problem):
+        return problem
+    if not isinstance(problem, Scene):
+        raise TypeError(
+            f"work_precision: got a {type(problem).__name__}, expected a Scene or a Problem of the gallery."
+        )
+    if duration is None:
+        raise ValueError("work_precision: got a scene without a duration, expected duration= [s].")
+    real_quantity("duration [s]", duration, above=0.0)
+    return Problem(problem, float(duration), exact, tuple(conserved))
+
+
+def default_rivals() -> tuple:
+    """The adaptive solvers that a user of diffrax would reach for first: Tsit5, and Dopri8 for many digits."""
+    import diffrax
+
+    return diffrax.Tsit5(), default_solver()
+
+
+def _smallest_size(scene: Scene) -> float:
+    """Typical size of the smaller of position and velocity: what an absolute tolerance is measured by."""
+    acceleration = np.asarray(scene.acceleration(jnp.zeros((), scene.state.dtype), scene.state))
+    sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in (*scene.state, acceleration)]
+    return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
+
+
+def _depends_on_velocity(scene: Scene) -> bool:
+    """Whether the forces look at the velocity: the promise of some methods depends on it."""
+    with jax.enable_x64(True):
+        scene = in_dtype(scene, jnp.float64)
+        t, (x, v) = jnp.zeros(()), scene.state
+        push = jnp.asarray(np.random.default_rng(0).normal(size=v.shape)) * (1 + jnp.abs(v))
+        return bool(
+            jnp.any(scene.acceleration(t, Particles(x, v + push)) != scene.acceleration(t, Particles(x, v - push)))
+        )
+
+
+def _promised_order(method, velocity_dependent):
+    promises = getattr(method, "promises", None)
+    if promises is None:
+        return float("nan")
+    return float(promises.order_with_drag if velocity_dependent else promises.order)
+
+
+class _Counter(NamedTuple):
+    """A system that counts how often a method asks for the right-hand side."""
+
+    scene: Scene
+    calls: list
+
+    def rate(self, t, state):
+        self.calls.append(t)
+        return self.scene.rate(t, state)
+
+    def kick(self, state, rate, dt):
+        return self.scene.kick(state, rate, dt)
+
+    def drift(self, state, dt):
+        return self.scene.drift(state, dt)
+
+
+def _evaluations(method, scene):
+    """Force evaluations a step: promised, or counted for a method that promises nothing."""
+    if hasattr(method, "promises"):
+        return method.promises.evaluations
+    counter = _Counter(scene, [])
+    jax.eval_shape(lambda state: method(counter, jnp.zeros((), scene.state.dtype), state, 1.0), scene.state)
+    return len(counter.calls)
+
+
+def _name(method):
+    return getattr(method, "__name__", type(method).__name__)
+
+
+__all__ = ["QUICK", "THOROUGH", "TOLERANCES", "Budget", "Run", "WorkPrecision", "default_rivals", "work_precision"]

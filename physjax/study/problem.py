@@ -1,0 +1,53 @@
+"""A scene that carries its own truth: how long to run it, what it must do, and how one knows."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from physjax.scene import Particles, Scene
+from physjax.stepping.reference import reference
+from physjax.study.energy import Conserved
+from physjax.trajectory import Trajectory
+
+
+class Truth(NamedTuple):
+    """Something that must be true of a scene: `measure(flight)` equals `expected` within `tolerance` (absolute).
+
+    `flight` is the scene's reference solution, so that a truth judges the physics and not a method.
+    """
+
+    statement: str
+    measure: Callable[[Trajectory], np.ndarray]
+    expected: np.ndarray | float
+    tolerance: np.ndarray | float
+
+
+class Problem(NamedTuple):
+    """A scene, its duration [s], and what is known about it.
+
+    `exact(times)` is the closed form, NumPy float64 with a leading axis of times; None where there is none. `conserved`
+    are quantities that the physics keeps constant. `frames` is the number of equally spaced moments at which errors are
+    measured.
+    """
+
+    scene: Scene
+    duration: float
+    exact: Callable[[np.ndarray], Particles] | None = None
+    conserved: tuple[Conserved, ...] = ()
+    truths: tuple[Truth, ...] = ()
+    frames: int = 32
+
+    @property
+    def times(self) -> np.ndarray:
+        """The moments at which errors are measured [s], the start included."""
+        return np.linspace(0.0, self.duration, self.frames + 1)
+
+    def verify(self) -> list[tuple[Truth, np.ndarray, bool]]:
+        """Every truth with the measured value and whether it holds."""
+        flight = reference(self.scene, self.times, rtol=1e-12, atol=1e-12)
+        measured = [np.asarray(truth.measure(flight)) for truth in self.truths]
+        return [
+            (truth, value, bool(np.all(np.abs(value - truth.expected) <= truth.tolerance)))
+            for truth, value in zip(self.truths, measured, strict=True)
+        ]

@@ -1,0 +1,142 @@
+"""The result of a work-precision study: every run, what it says about each method, as table, CSV and picture."""
+
+import csv
+import math
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from physjax.files import replacing
+from physjax.show.report import seconds_text, table
+
+ERRORS = (1e-2, 1e-4, 1e-6)
+"""Errors (relative to the extent of the path) for which the fastest method is named."""
+
+
+class Run(NamedTuple):
+    """One run of one method. Errors are relative to the extent of the path; `drifts` to the size of the conserved quantity.
+
+    `dt` [s] is None for adaptive rivals, `tolerance` is None for fixed steps. `seconds` is the least and
+    `seconds_median` the median of several timings, compiling apart.
+    """
+
+    method: str
+    dt: float | None
+    tolerance: float | None
+    steps: int
+    evaluations: int
+    seconds: float
+    seconds_median: float
+    compile_seconds: float
+    final_error: float
+    path_error: float
+    drifts: tuple[float, ...]
+
+    @property
+    def status(self) -> str:
+        """`ok`; `not finite`; or `off the path`: wrong by more than the path is long."""
+        if not math.isfinite(self.path_error):
+            return "not finite"
+        return "ok" if self.path_error <= 1.0 else "off the path"
+
+
+class WorkPrecision(NamedTuple):
+    """All runs of a scene under its methods and rivals, their truth, and that truth's own error (`floor`)."""
+
+    name: str
+    runs: tuple[Run, ...]
+    promised: dict[str, float]
+    truth: str
+    floor: float
+    duration: float
+    conserved: tuple[str, ...]
+    dtype: str
+    path: tuple[np.ndarray, np.ndarray]
+    couples: bool
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods and rivals, in the order they ran."""
+        return tuple(dict.fromkeys(run.method for run in self.runs))
+
+    def of(self, method: str) -> tuple[Run, ...]:
+        """The runs of one method, from coarse to fine."""
+        return tuple(run for run in self.runs if run.method == method)
+
+    def observed_order(self, method: str) -> float:
+        """Slope of log error against log dt over the finest runs above rounding; inf if all is rounding, NaN if unknown."""
+        runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
+        resolved = [run for run in runs if self._rounding(run) < run.path_error < 0.05]
+        if runs and all(run.path_error <= self._rounding(run) for run in runs):
+            return float("inf")
+        finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt]
+        if len(finest) < 3:
+            return float("nan")
+        return float(np.polyfit(np.log([r.dt for r in finest]), np.log([r.path_error for r in finest]), 1)[0])
+
+    def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
+        """The run with the least time whose path error stays below `error`; None if none does."""
+        return _cheapest([run for run in self.runs if rivals or run.tolerance is None], error)
+
+    def table(self) -> str:
+        """A line for each method: order promised and observed, its cheapest run for each of `ERRORS`, and where it failed."""
+        headers = [
+            "method",
+            "order",
+            "observed",
+            *(f"error {e:.0e}" for e in ERRORS),
+            "fails from dt [s]",
+            "compile [s]",
+        ]
+        rows = []
+        for method in self.methods:
+            runs = self.of(method)
+            cheapest = [_cheapest(runs, error) for error in ERRORS]
+            failed = [run.dt for run in runs if run.dt is not None and run.status != "ok"]
+            rows.append(
+                [
+                    method,
+                    _number(self.promised.get(method), ".0f"),
+                    _order(self.observed_order(method)) if method in self.promised else "-",
+                    *(seconds_text(run.seconds) if run else "-" for run in cheapest),
+                    f"{min(failed):.3g}" if failed else "-",
+                    f"{runs[0].compile_seconds:.2f}",
+                ]
+            )
+        return table(headers, rows)
+
+    def to_csv(self, path: str | os.PathLike) -> None:
+        """Write every run as one line of a CSV file; whole or absent."""
+        fields = [name for name in Run._fields if name != "drifts"]
+        with replacing(path) as file:
+            writer = csv.writer(file)
+            writer.writerow(
+                ["scene", *fields, *(f"drift of {name}" for name in self.conserved), "status", "truth", "floor"]
+            )
+            for run in self.runs:
+                numbers = [getattr(run, name) for name in fields]
+                writer.writerow([self.name, *numbers, *run.drifts, run.status, self.truth, self.floor])
+
+    def plot(self, figure: Any = None) -> Any:
+        """Draw the study: the path, error against time, error against step, and drift or cost. Returns the matplotlib figure."""
+        from physjax.show import plot
+
+        return plot.work_precision(self, figure)
+
+    def _rounding(self, run: Run) -> float:
+        """Errors below this are rounding, or the truth's own."""
+        return max(10 * self.floor, 100 * float(np.finfo(self.dtype).eps) * math.sqrt(run.steps))
+
+
+def _cheapest(runs: Sequence[Run], error: float) -> Run | None:
+    return min((run for run in runs if run.path_error <= error), key=lambda run: run.seconds, default=None)
+
+
+def _order(order: float) -> str:
+    return "exact" if math.isinf(order) else _number(order, ".2f")
+
+
+def _number(value: float | None, spec: str) -> str:
+    return "-" if value is None or math.isnan(value) else format(value, spec)
