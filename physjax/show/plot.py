@@ -4,7 +4,7 @@ Every function returns matplotlib axes or a figure and accepts one to draw into.
 """
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -12,9 +12,6 @@ from jax.typing import ArrayLike
 from physjax.show.report import seconds_text
 from physjax.stepping.methods import METHODS
 from physjax.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from physjax.study.work_precision import Run, WorkPrecision
 
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
 """Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""
@@ -79,8 +76,8 @@ def _paths(time: np.ndarray, position: np.ndarray, every: int, color: Any, ax: A
     return ax
 
 
-def work_precision(result: "WorkPrecision", figure: Any = None) -> Any:
-    """Four panels of a work-precision study: path, error against time, error against step, drift (or evaluations).
+def work_precision(result: Any, figure: Any = None) -> Any:
+    """Four panels of an `accuracy.WorkPrecision`: path, error against time, error against step, drift (or evaluations).
 
     Runs that failed stand as crosses on the upper edge, where they died. Returns the figure.
     """
@@ -122,7 +119,7 @@ def work_precision(result: "WorkPrecision", figure: Any = None) -> Any:
     return figure
 
 
-def _curves(ax: Any, result: "WorkPrecision", x: str, y: str) -> None:
+def _curves(ax: Any, result: Any, x: str, y: str) -> None:
     """A line for each method through the runs that held, and crosses on the upper edge for those that failed."""
     for method in result.methods:
         runs = [run for run in result.of(method) if getattr(run, x) is not None]
@@ -143,11 +140,11 @@ def _curves(ax: Any, result: "WorkPrecision", x: str, y: str) -> None:
     ax.grid(which="major", color="0.9")
 
 
-def _value(run: "Run", y: str) -> float:
+def _value(run: Any, y: str) -> float:
     return run.drifts[0] if y == "drift" else getattr(run, y)
 
 
-def _legend(result: "WorkPrecision", method: str) -> str:
+def _legend(result: Any, method: str) -> str:
     if method not in result.promised:
         return f"{method} (adaptive)"
     order = result.observed_order(method)

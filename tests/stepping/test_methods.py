@@ -1,12 +1,20 @@
 """Each method against its promises: order, evaluations, stability, and the exact cases."""
 
+import math
+from typing import ClassVar
+
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, forces, methods, simulate
+from physjax import Particles, Scene, forces, methods, ode_term, reference, simulate
+from physjax.physics.forces import independent
+from physjax.scene import as_module
 from physjax.stepping.methods import METHODS
+from physjax.stepping.simulate import sample
+from physjax.vectors import dot, norm
 
 ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
@@ -63,3 +71,167 @@ def test_stable_to_its_limit_and_not_beyond(method):
         assert radius(1.02 * limit) > 1 + 1e-3
     else:
         assert radius(0.1) > 1 + 1e-6
+
+
+def test_constant_velocity_is_exact_to_rounding_under_every_method(precision):
+    x, v = jnp.asarray([[1.0, 2.0, 3.0]], precision.dtype), jnp.asarray([[3.0, -4.0, 0.5]], precision.dtype)
+    for method in METHODS.values():
+        film = simulate(Scene(Particles(x, v)), method, dt=0.125, steps=64)
+        exact = np.asarray(x) + np.asarray(v) * np.asarray(film.time)[:, None, None]
+        np.testing.assert_allclose(film.position, exact, atol=64 * 32 * precision.eps, rtol=0)
+        np.testing.assert_array_equal(film.velocity, np.tile(v, (65, 1, 1)))
+
+
+def test_the_momentum_form_is_semi_implicit_euler():
+    x, v = np.array([[0.0, 1.0], [2.0, -1.0]]), np.array([[1.0, 0.0], [-3.0, 2.0]])
+    mass, dt, b, k = np.array([0.5, 2.0]), 0.01, 0.3, 7.0
+    scene = Scene(
+        Particles(jnp.asarray(x), jnp.asarray(v)),
+        mass=mass,
+        forces=(forces.Gravity(), forces.StokesDrag(b), forces.Anchor(point=jnp.zeros(2), stiffness=k)),
+    )
+    p = mass[:, None] * v
+    for _ in range(500):
+        p = p + (mass[:, None] * np.array([0.0, -9.8]) - b * p / mass[:, None] - k * x) * dt
+        x = x + p / mass[:, None] * dt
+    final = simulate(scene, methods.semi_implicit_euler, dt=dt, steps=500, save_every=500)
+    np.testing.assert_allclose(final.position[-1], x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(final.velocity[-1] * mass[:, None], p, rtol=0, atol=1e-12)
+
+
+@independent
+def wave(t, state, mass):
+    """A push that changes with time: a method that looks at the wrong moment loses its order."""
+    return jnp.stack([jnp.cos(2.0 * t), jnp.sin(3.0 * t)])
+
+
+CONSERVATIVE = (forces.Gravity(), forces.Anchor(point=jnp.zeros(2), stiffness=9.0, rest_length=0.6), wave)
+WITH_DRAG = (
+    *CONSERVATIVE,
+    forces.StokesDrag(0.3),
+    forces.QuadraticDrag(area=1.0, coefficient=0.5, wind=jnp.asarray([1.0, 0.5])),
+)
+
+
+@pytest.fixture(scope="module", params=[CONSERVATIVE, WITH_DRAG], ids=["position-only", "drag"])
+def pendulum(request):
+    """An elastic pendulum, shaken, with and without drag, and its state at 2 s."""
+    state = Particles(jnp.asarray([0.8, -0.3]), jnp.asarray([0.4, 0.9]))
+    scene = Scene(state, mass=0.7, forces=request.param)
+    truth = reference(scene, [2.0], rtol=1e-13, atol=1e-13).state
+    return scene, jax.tree.map(lambda leaf: leaf[-1], truth), request.param is WITH_DRAG
+
+
+@ALL
+def test_order_is_the_promised_one(method, pendulum):
+    scene, truth, drag = pendulum
+    promised = method.promises.order_with_drag if drag else method.promises.order
+    errors = []
+    for steps in (256, 512, 1024):
+        found = sample(scene, as_module(method), 2.0 / steps, steps, frames=1)
+        errors.append(max(np.abs(a[-1] - b).max() for a, b in zip(found, truth, strict=True)))
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), promised, rtol=0, atol=0.15)
+
+
+class Classical(diffrax.AbstractERK):
+    """The classical tableau, which diffrax does not ship."""
+
+    tableau: ClassVar = diffrax.ButcherTableau(
+        c=np.array([0.5, 0.5, 1.0]),
+        a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
+        b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+        b_error=np.zeros(4),
+    )
+    interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 4
+
+
+@pytest.mark.parametrize(("method", "solver"), [(methods.euler, diffrax.Euler()), (methods.rk4, Classical())])
+def test_euler_and_rk4_equal_diffrax_after_1000_steps(method, solver):
+    dt, steps = 1 / 256, 1000
+    state = Particles(jnp.asarray([0.8, -0.3]), jnp.asarray([0.4, 0.9]))
+    scene = Scene(state, mass=0.7, forces=WITH_DRAG)
+    ours = simulate(scene, method, dt=dt, steps=steps, save_every=steps).final_scene.state
+    solution = diffrax.diffeqsolve(ode_term(scene), solver, 0.0, steps * dt, dt, state, max_steps=steps)
+    for mine, theirs in zip(ours, solution.ys, strict=True):
+        np.testing.assert_allclose(mine, theirs[-1], rtol=0, atol=1e-12)
+
+
+def test_on_kepler_09_verlet_bounds_the_energy_for_100_periods_and_euler_loses_the_planet():
+    e, steps = 0.9, 2000
+    perihelion, speed = 1 - e, ((1 + e) / (1 - e)) ** 0.5
+    state = Particles(jnp.asarray([[0.0, 0.0], [perihelion, 0.0]]), jnp.asarray([[0.0, 0.0], [0.0, speed]]))
+    scene = Scene(state, forces=(forces.Gravitation(gm=jnp.asarray([1.0, 0.0])),))
+
+    def energy(t, state):
+        return 0.5 * dot(state.velocity[1], state.velocity[1]) - 1.0 / norm(state.position[1] - state.position[0])
+
+    def energies(method):
+        run = simulate(scene, method, dt=2 * math.pi / steps, steps=100 * steps, save_every=steps // 200, record=energy)
+        return np.asarray(run.recorded)
+
+    kept, lost = energies(methods.verlet), energies(methods.euler)
+    error = np.abs(kept + 0.5)
+    assert error.max() < 0.0125  # 2.5 % of the energy, at every perihelion
+    assert error[-2000:].max() <= 1.1 * error[:2000].max()  # the last ten periods are no worse than the first ten
+    assert lost[200:].min() > 0.0  # unbound within the first period, for good
+
+
+def test_the_figure_eight_comes_back_after_one_period():
+    a, v = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
+    state = Particles(jnp.asarray([a, -a, 0 * a]), jnp.asarray([-v / 2, -v / 2, v]))
+    scene = Scene(state, forces=(forces.Gravitation(G=1.0),))
+    steps = 6326  # dt = 1e-3 to five digits
+    run = simulate(scene, methods.rk4, dt=6.32591398 / steps, steps=steps, save_every=steps)
+    for start, end in zip(state, run.final_scene.state, strict=True):
+        np.testing.assert_allclose(end, start, rtol=0, atol=1e-6)
+
+
+def test_midpoint_lets_an_oscillation_grow_by_its_known_factor_a_step():
+    step, omega = np.asarray([0.01, 0.1, 0.5, 1.0]), 2.0
+    state = Particles(jnp.zeros((4, 1)), jnp.ones((4, 1)))
+    scene = Scene(state, forces=(forces.Anchor(point=jnp.zeros(1), stiffness=omega**2),))
+    x, v = simulate(scene, methods.midpoint, dt=step / omega, steps=10).state
+    amplitude = np.hypot(omega * x, v)[..., 0]
+    np.testing.assert_allclose(amplitude[1:] / amplitude[:-1], np.tile(np.sqrt(1 + step**4 / 4), (10, 1)), rtol=1e-14)
+
+
+def growth(method, stiffness, damping, dt):
+    """Largest factor by which one step stretches an oscillation of unit mass."""
+    spring = forces.Anchor(point=jnp.zeros(1), stiffness=stiffness, damping=damping)
+    scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(spring,))
+    step = lambda y: jnp.concatenate(method(scene, 0.0, Particles(y[:1], y[1:]), dt))  # noqa: E731
+    return np.abs(np.linalg.eigvals(np.asarray(jax.jacfwd(step)(jnp.zeros(2))))).max()
+
+
+@pytest.mark.parametrize("k", [1.0, 50.0])
+@pytest.mark.parametrize("c", [0.5, 3.0, 20.0])
+def test_damped_limits_are_those_of_the_closed_forms(k, c):
+    semi_implicit = (-c + math.sqrt(c * c + 4 * k)) / k  # k dt² + 2c dt = 4
+    explicit = c / k if c * c < 4 * k else 4 / (c + math.sqrt(c * c - 4 * k))
+    for method, limit in ((methods.semi_implicit_euler, semi_implicit), (methods.euler, explicit)):
+        assert growth(method, k, c, 0.999 * limit) < 1
+        assert growth(method, k, c, 1.001 * limit) > 1
+
+
+@ALL
+def test_a_method_moves_any_state_that_can_kick_and_drift(method):
+    """A pendulum of its own making, a dict of numbers, moves like the same pendulum told as a scene."""
+
+    class Pendulum:
+        def rate(self, t, y):
+            return {"angle": y["rate"], "rate": -jnp.sin(y["angle"])}
+
+        def kick(self, y, slope, dt):
+            return y | {"rate": y["rate"] + dt * slope["rate"]}
+
+        def drift(self, y, dt):
+            return y | {"angle": y["angle"] + dt * y["rate"]}
+
+    y, told = {"angle": jnp.asarray(1.0), "rate": jnp.asarray(0.0)}, Particles(jnp.asarray([1.0]), jnp.asarray([0.0]))
+    scene = Scene(told, forces=(lambda t, state, mass: -jnp.sin(state.position),))
+    for i in range(20):
+        y, told = method(Pendulum(), 0.1 * i, y, 0.1), method(scene, 0.1 * i, told, 0.1)
+    np.testing.assert_allclose([y["angle"], y["rate"]], np.ravel(told), rtol=1e-13)

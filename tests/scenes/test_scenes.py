@@ -1,0 +1,66 @@
+"""Every scene of the gallery keeps its own truth, and real data is met."""
+
+import jax
+import numpy as np
+import pytest
+
+from physjax import methods, reference, simulate
+from physjax.scenes import SCENES, title
+from physjax.scenes.gallery import table
+
+
+@pytest.fixture(params=SCENES.values(), ids=SCENES)
+def problem(request):
+    return request.param()
+
+
+def test_every_truth_holds(problem):
+    verdicts = problem.verify()
+    assert verdicts, "a scene without a truth proves nothing"
+    for truth, measured, holds in verdicts:
+        assert holds, f"{truth.statement}: measured {measured}, expected {truth.expected}"
+
+
+def test_the_closed_form_solves_the_equations_of_motion(problem):
+    if problem.exact is None:
+        pytest.skip("no closed form")
+    flight = reference(problem.scene, problem.times, rtol=1e-12, atol=1e-12)
+    exact = problem.exact(problem.times)
+    size = np.abs(exact.position).max()
+    np.testing.assert_allclose(flight.position, exact.position, atol=1e-9 * size, rtol=0)
+    np.testing.assert_allclose(flight.velocity, exact.velocity, atol=1e-8 * np.abs(exact.velocity).max(), rtol=0)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_is_described_and_follows_the_float_type_of_the_moment(name):
+    assert 20 < len(title(name)) < 120
+    with jax.enable_x64(False):
+        assert SCENES[name]().scene.state.dtype == np.float32
+
+
+def errors_in_km(method, dt_days, days):
+    problem = SCENES["solar_system"]()
+    steps = round(days / dt_days)
+    end = simulate(problem.scene, method, dt=days * 86400.0 / steps, steps=steps, save_every=steps).final_scene.state
+    ephemeris = table("solar_system_de421.csv")
+    then = ephemeris["julian_date_tdb"] == ephemeris["julian_date_tdb"].min() + days
+    position = np.stack([ephemeris[c][then] for c in ("x_m", "y_m", "z_m")], axis=-1)
+    off = np.linalg.norm(np.asarray(end.position) - position, axis=-1) / 1e3
+    return dict(zip(ephemeris["body"][then], off, strict=True)), problem.scene, end
+
+
+def test_rk4_lands_where_newtons_law_leaves_the_planets_after_ten_years():
+    off, scene, end = errors_in_km(methods.rk4, 0.1, 3652.5)
+    expected = {"mercury": 1823, "venus": 901, "earthmoon": 561, "mars": 341, "jupiter": 72.2, "saturn": 15.5}
+    expected |= {"uranus": 0.38, "neptune": 0.155, "pluto": 0.24}
+    for planet, km in expected.items():
+        assert off[planet] == pytest.approx(km, rel=0.05), planet
+    momentum = lambda state: np.sum(np.asarray(scene.mass)[:, None] * np.asarray(state.velocity), axis=0)  # noqa: E731
+    size = np.sum(np.asarray(scene.mass) * np.linalg.norm(np.asarray(scene.state.velocity), axis=-1))
+    assert np.abs(momentum(end) - momentum(scene.state)).max() < 1e-12 * size
+
+
+def test_thirty_days_of_the_inner_planets():
+    off, _, _ = errors_in_km(methods.rk4, 0.05, 30)
+    for planet, km in {"mercury": 9.2, "earthmoon": 1.5, "mars": 0.2}.items():
+        assert off[planet] == pytest.approx(km, abs=0.05), planet

@@ -1,0 +1,86 @@
+"""Pictures have axes with units, the data that was given, and the same style for the same method."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from physjax import methods, simulate
+from physjax.scenes import SCENES
+from physjax.show import plot, report
+from physjax.stepping.methods import METHODS
+from physjax.study.accuracy import Budget, work_precision
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+@pytest.mark.parametrize(("name", "labels"), [("oscillator", "time [s] position [m]"), ("kepler", "x [m] y [m]")])
+def test_paths_are_drawn_with_units(name, labels):
+    problem = SCENES[name]()
+    flight = simulate(problem.scene, methods.verlet, dt=problem.duration / 512, steps=512, save_every=8)
+    ax = plot.paths(flight, every=2)
+    assert f"{ax.get_xlabel()} {ax.get_ylabel()}" == labels
+    np.testing.assert_allclose(ax.lines[0].get_ydata()[-1], flight.position[-1, 0, -1])
+
+
+def test_paths_in_space_and_into_given_axes():
+    problem = SCENES["solar_system"]()
+    flight = simulate(problem.scene, methods.leapfrog, dt=86400.0, steps=64)
+    ax = plot.paths(flight, color=np.arange(10.0))
+    assert ax.get_zlabel() == "z [m]"
+    assert plot.paths(flight, ax=ax) is ax
+
+
+def test_a_study_is_drawn_with_its_failures():
+    springs = SCENES["oscillator"](stiffness=(1.0, 1000.0))
+    study = work_precision(
+        springs, dts=2.0 ** -np.arange(2, 15), rivals=(), budget=Budget(0.02, 1, 2.0), name="oscillator"
+    )
+    figure = study.plot()
+    _, speed, order, kept = figure.axes
+    assert speed.get_xlabel() == "run time [s]"
+    assert "dt [s]" in order.get_xlabel()
+    assert "energy" in kept.get_ylabel()
+    assert speed.get_xscale() == speed.get_yscale() == "log"
+    crosses = [line for line in order.lines if line.get_marker() == "x" and len(line.get_xdata())]
+    assert len(crosses) == len(METHODS)  # every method fails at a sixth of a second on the stiff spring
+    legend = " ".join(text.get_text() for text in figure.legends[0].get_texts())
+    assert "rk4: order" in legend
+    assert "failed" in legend
+    for ax in figure.axes:
+        assert ax.get_xlabel()
+        assert ax.get_ylabel()
+        assert ax.get_title()
+
+
+def test_methods_keep_apart_in_colour_and_marker():
+    styles = [plot.style(name) for name in METHODS]
+    assert len({style["color"] for style in styles}) == len(METHODS)
+    assert len({style["marker"] for style in styles}) == len(METHODS)
+
+
+def test_table_is_aligned():
+    text = report.table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
+    lines = text.splitlines()
+    assert len({len(line) for line in lines}) == 1
+    assert lines[2].startswith("euler ")
+    assert lines[3].endswith(" 20")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(3e-6, "3 µs"), (0.0123, "12.3 ms"), (2.5, "2.5 s"), (86400 * 10, "10 d")]
+)
+def test_times_are_readable(seconds, text):
+    assert report.seconds_text(seconds) == text
+
+
+def test_page_is_self_contained():
+    page = report.page("title", "a < b", [report.Section("kepler", "two bodies", b"png", "table")])
+    assert "a &lt; b" in page
+    assert "data:image/png;base64," in page
+    assert "src=" in page
+    assert "http" not in page.replace("http-equiv", "")
+    assert "jax " in page

@@ -1,0 +1,150 @@
+"""Work-precision: orders found, failures kept, truths named, one compilation a method."""
+
+import csv
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physjax import Particles, Scene, forces, methods
+from physjax.scenes import SCENES
+from physjax.stepping.methods import METHODS
+from physjax.study import accuracy
+from physjax.study.accuracy import Budget, work_precision
+
+FEW = Budget(seconds=0.02, repeats=1, refinement=2.0)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """Two light oscillators under every method, at steps from coarse to fine."""
+    springs = SCENES["oscillator"](stiffness=(1.0, 9.0))
+    return work_precision(springs, dts=2.0 ** -np.arange(4, 15), rivals=(), name="oscillator", budget=FEW)
+
+
+def test_every_method_shows_its_promised_order(swing):
+    for name, method in METHODS.items():
+        assert swing.observed_order(name) == pytest.approx(method.promises.order, abs=0.15), name
+
+
+def test_drag_lowers_leapfrog_to_first_order_and_the_promise_says_so():
+    fall = work_precision(SCENES["fall_with_drag"](), [methods.leapfrog, methods.verlet], rivals=(), budget=FEW)
+    assert fall.promised == {"leapfrog": 1, "verlet": 2}
+    assert fall.observed_order("leapfrog") == pytest.approx(1, abs=0.15)
+    assert fall.observed_order("verlet") == pytest.approx(2, abs=0.15)
+
+
+def test_runs_that_fail_are_kept_with_their_step():
+    springs = SCENES["oscillator"](stiffness=(1.0, 1000.0))
+    stiff = work_precision(springs, [methods.rk4], dts=2.0 ** -np.arange(2, 8), rivals=(), budget=FEW)
+    rk4 = stiff.of("rk4")
+    limit = 2 * np.sqrt(2) / np.sqrt(1000)
+    assert {run.status for run in rk4 if run.dt > 1.02 * limit} <= {"not finite", "off the path"}
+    assert all(run.status == "ok" for run in rk4 if run.dt < 0.9 * limit)
+    assert rk4[0].status != "ok"
+    assert f"{min(run.dt for run in rk4 if run.status != 'ok'):.3g}" in stiff.table()
+
+
+def test_steps_fit_between_the_moments_compared(swing):
+    problem = SCENES["oscillator"]()
+    for run in swing.of("verlet"):
+        assert run.steps % problem.frames == 0
+        assert run.dt * run.steps == pytest.approx(problem.duration, rel=1e-12)
+        assert run.evaluations == 2 * run.steps
+
+
+def test_the_closed_form_is_the_truth_where_there_is_one_else_a_reference_with_its_own_error():
+    assert work_precision(SCENES["projectile"](), [methods.rk4], [0.1], rivals=(), budget=FEW).truth == "closed form"
+    eight = work_precision(SCENES["figure_eight"](), [methods.rk4], [0.01], rivals=(), budget=FEW)
+    assert "Dopri8" in eight.truth
+    assert 0 < eight.floor < 1e-10
+
+
+def test_a_projectile_is_exact_for_second_order(swing):
+    throw = work_precision(
+        SCENES["projectile"](), [methods.midpoint, methods.euler], [0.1, 0.05, 0.02, 0.01], rivals=(), budget=FEW
+    )
+    assert throw.observed_order("midpoint") == float("inf")
+    assert "exact" in throw.table()
+    assert throw.observed_order("euler") == pytest.approx(1, abs=0.02)
+
+
+def test_diffrax_runs_in_the_same_study():
+    eight = work_precision(SCENES["figure_eight"](), [methods.rk4], [0.02], tolerances=(1e-3, 1e-6, 1e-9), budget=FEW)
+    assert eight.methods == ("rk4", "diffrax Tsit5", "diffrax Dopri8")
+    errors = [run.path_error for run in eight.of("diffrax Tsit5")]
+    assert errors[0] > errors[1] > errors[2] > eight.floor
+    assert all(run.seconds > 0 and run.seconds_median >= run.seconds for run in eight.runs)
+
+
+def test_one_compilation_serves_all_steps():
+    traces = []
+
+    @forces.independent
+    def counted(t, state, mass):
+        traces.append(t)
+        return -state.position
+
+    scene = Scene(Particles(jnp.ones((3, 2)), jnp.zeros((3, 2))), forces=(counted,))
+    study = lambda dts: work_precision(scene, [methods.euler], dts, duration=1.0, rivals=(), budget=FEW)  # noqa: E731
+    study([0.01])
+    one = len(traces)
+    traces.clear()
+    study([0.02, 0.01, 0.005, 0.0025, 0.001])
+    assert len(traces) <= one
+
+
+def test_float32_shows_its_rounding():
+    swing32 = work_precision(SCENES["oscillator"](), [methods.rk4], [1e-3], dtype=np.float32, rivals=(), budget=FEW)
+    assert swing32.dtype == "float32"
+    assert 1e-7 < swing32.runs[0].path_error < 1e-3
+
+
+def test_a_method_of_ones_own_is_counted_and_unpromised():
+    def heun(system, t, state, dt):
+        first = system.rate(t, state)
+        ahead = system.drift(system.kick(state, first, dt), dt)
+        return Particles(
+            *(y + dt / 2 * (a + b) for y, a, b in zip(state, first, system.rate(t + dt, ahead), strict=True))
+        )
+
+    study = work_precision(SCENES["projectile"](), [heun], [0.1], rivals=(), budget=FEW)
+    assert study.runs[0].evaluations == 2 * study.runs[0].steps
+    assert np.isnan(study.promised["heun"])
+
+
+def test_csv_holds_every_run(swing, tmp_path):
+    swing.to_csv(tmp_path / "runs.csv")
+    with open(tmp_path / "runs.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(swing.runs)
+    assert float(rows[0]["path_error"]) == swing.runs[0].path_error
+    assert {"drift of energy", "status", "seconds_median", "compile_seconds"} <= set(rows[0])
+
+
+def test_the_fastest_run_keeps_its_error(swing):
+    best = swing.fastest(1e-4)
+    assert best.path_error <= 1e-4
+    assert all(run.seconds >= best.seconds for run in swing.runs if run.path_error <= 1e-4)
+    assert swing.fastest(1e-30) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"problem": 3}, "expected a Scene or a Problem"),
+        ({}, "duration"),
+        ({"duration": -1.0}, "duration"),
+        ({"duration": 1.0, "dts": [0.1, -0.1]}, "dts"),
+        ({"duration": 1.0, "dts": [0.1, np.nan]}, "dts"),
+    ],
+)
+@pytest.mark.usefixtures("unannotated")
+def test_bad_input_is_refused_in_plain_words(arguments, message):
+    scene = Scene(Particles(jnp.zeros(2), jnp.ones(2)), forces=(forces.Gravity(),))
+    with pytest.raises((TypeError, ValueError), match=message):
+        work_precision(**({"problem": scene} | arguments))
+
+
+def test_rivals_can_be_chosen():
+    assert [type(solver).__name__ for solver in accuracy.default_rivals()] == ["Tsit5", "Dopri8"]

@@ -1,0 +1,248 @@
+"""The house rules: imports point down, files stay short, names are documented, and a scene pays only for what it uses."""
+
+import ast
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import physjax
+from physjax import Particles, Scene, forces, methods, simulate
+
+ROOT = Path(physjax.__file__).parent
+FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("*.py"))}
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
+
+FLOORS = (
+    {"vectors", "checks", "files"},
+    {"scene"},
+    {"trajectory"},
+    {"physics", "stepping"},
+    {"show"},
+    {"study"},
+    {"scenes"},
+    {"cli"},
+    {"__main__"},
+)
+FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+
+
+def room(file):
+    """The part of the house a file is in: its folder, or its own name."""
+    return Path(file).parts[0].removesuffix(".py")
+
+
+def imports(tree, file):
+    """Dotted names of all modules of physjax that a file imports, at its top or inside a function."""
+    package = ["physjax", *Path(file).parts[:-1]]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(filter(None, (base, node.module)))
+            yield from (f"{module}.{alias.name}" for alias in node.names)
+
+
+# the arrows
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if file != "__init__.py"])
+def test_imports_only_point_down(file):
+    assert room(file) in FLOOR, f"{file} is not on any floor of the house; say where it belongs"
+    for name in imports(TREES[file], file):
+        top, _, rest = name.partition(".")
+        if top != "physjax":
+            continue
+        target = rest.partition(".")[0]
+        assert target in FLOOR, f"{file} imports {name} through the front door; import from the module that defines it"
+        assert target == room(file) or FLOOR[target] < FLOOR[room(file)], (
+            f"{file} imports {name}, which is not below it"
+        )
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "found"),
+    [
+        ("physics/forces.py", "def f():\n    from physjax.stepping import methods", "physjax.stepping.methods"),
+        ("physics/forces.py", "from ..stepping import methods", "physjax.stepping.methods"),
+        ("physics/forces.py", "from . import gravitation", "physjax.physics.gravitation"),
+        ("scene.py", "import physjax.study.energy as e", "physjax.study.energy"),
+        ("scene.py", "from physjax import Particles", "physjax.Particles"),
+    ],
+)
+def test_every_way_to_import_is_seen(file, line, found):
+    assert list(imports(ast.parse(line), file)) == [found]
+
+
+# style
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_no_file_is_over_400_lines(file):
+    assert len(FILES[file].read_text(encoding="utf-8").splitlines()) <= 400
+
+
+def public(node):
+    return isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_public_name_is_documented(file):
+    tree = TREES[file]
+    names = [(file, tree)] + [(node.name, node) for node in tree.body if public(node)]
+    for _, node in list(names):
+        if isinstance(node, ast.ClassDef):
+            names += [(f"{node.name}.{method.name}", method) for method in node.body if public(method)]
+    assert [name for name, node in names if not ast.get_docstring(node)] == []
+
+
+def test_every_exported_name_exists_and_is_documented():
+    for file in FILES:
+        if file.startswith("__main__"):
+            continue
+        module = importlib.import_module(
+            ".".join(("physjax", *Path(file).with_suffix("").parts)).removesuffix(".__init__")
+        )
+        for name in getattr(module, "__all__", ()):
+            assert inspect.getdoc(getattr(module, name)), f"{module.__name__}.{name}"
+    assert {"Particles", "Scene", "Trajectory", "simulate", "reference", "forces", "methods", "loads"} <= set(
+        physjax.__all__
+    )
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if room(file) in {"physics", "stepping", "vectors"}])
+def test_vectors_are_written_by_components_and_never_scattered(file):
+    slow = {"einsum", "tensordot", "matmul", "vdot", "linalg"}
+    for node in ast.walk(TREES[file]):
+        assert not (isinstance(node, ast.Attribute) and node.attr in slow), f"{file}:{node.lineno} {node.attr}"
+        assert not (isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult)), f"{file}:{node.lineno} @"
+        scatter = isinstance(node, ast.Subscript) and getattr(node.value, "attr", "") == "at"
+        assert not scatter, f"{file}:{node.lineno} .at["
+
+
+# a scene pays only for what it uses
+
+
+def semi_implicit_euler(x, v, dt, a):
+    v = v + dt * a(x, v)
+    return x + dt * v, v
+
+
+def verlet(x, v, dt, a):
+    start = a(x, v)
+    half = v + dt / 2 * start
+    x = x + dt * half
+    return x, half + dt / 2 * a(x, half + dt / 2 * start)
+
+
+def rk4(x, v, dt, a):
+    a1 = a(x, v)
+    v2 = v + dt / 2 * a1
+    a2 = a(x + dt / 2 * v, v2)
+    v3 = v + dt / 2 * a2
+    a3 = a(x + dt / 2 * v2, v3)
+    v4 = v + dt * a3
+    a4 = a(x + dt * v3, v4)
+    return x + dt / 6 * (v + 2.0 * v2 + 2.0 * v3 + v4), v + dt / 6 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+
+
+BY_HAND = pytest.mark.parametrize("by_hand", [semi_implicit_euler, verlet, rk4])
+X, V, STEP = np.zeros((64, 2), np.float32), np.ones((64, 2), np.float32), np.float32(0.01)
+
+
+def compiled(step, *arguments):
+    """A step's compiled text, the count of each of its instructions (fused ones too), and its floating-point operations."""
+    program = jax.jit(step).lower(*arguments).compile()
+    text = program.as_text()
+    operations = Counter(re.findall(r"^\s+(?:ROOT )?%?\S+ = .*? ([a-z][\w\-]*)\(", text, re.MULTILINE))
+    return text, operations, program.cost_analysis()["flops"]
+
+
+def compiled_scene(method, *parts, mass=1.0):
+    scene = Scene(Particles(jnp.asarray(X), jnp.asarray(V)), mass=mass, forces=parts)
+    return compiled(lambda scene, dt: scene.step(method, 0.0, dt).state, scene, STEP)
+
+
+@BY_HAND
+def test_a_scene_with_gravity_alone_compiles_to_the_hand_written_step(by_hand):
+    def fall(x, v, dt, g):
+        return by_hand(x, v, dt, lambda x, v: jnp.broadcast_to(-g * jnp.asarray([0.0, 1.0], np.float32), v.shape))
+
+    text, operations, flops = compiled_scene(getattr(methods, by_hand.__name__), forces.Gravity())
+    _, by_hand_operations, by_hand_flops = compiled(fall, X, V, STEP, np.float32(9.8))
+    assert operations.total() <= by_hand_operations.total()
+    assert flops <= by_hand_flops
+    assert set(operations) <= set(by_hand_operations)
+    assert not {"gather", "scatter", "sqrt", "rsqrt", "while", "select", "compare", "reduce", "call"} & set(operations)
+    assert not re.search(r"f32\[(\d+,)*3\]|f64\[", text)
+
+
+@BY_HAND
+def test_a_scene_with_drag_compiles_to_the_hand_written_step_with_its_square_root(by_hand):
+    def fly(x, v, dt, g, area, coefficient, density, mass):
+        def acceleration(x, v):
+            speed = jnp.sqrt(v[:, 0] * v[:, 0] + v[:, 1] * v[:, 1])
+            drag = (-0.5 * density * coefficient * area * speed)[:, None] * v
+            return jnp.broadcast_to(-g * jnp.asarray([0.0, 1.0], np.float32), v.shape) + 1.0 / mass * drag
+
+        return by_hand(x, v, dt, acceleration)
+
+    drag = forces.QuadraticDrag(area=0.1, coefficient=0.5)
+    text, operations, flops = compiled_scene(getattr(methods, by_hand.__name__), forces.Gravity(), drag)
+    numbers = np.asarray([9.8, 0.1, 0.5, 1.225, 1.0], np.float32)
+    _, by_hand_operations, by_hand_flops = compiled(fly, X, V, STEP, *numbers)
+    assert operations.total() <= by_hand_operations.total()
+    assert flops <= by_hand_flops
+    assert 0 < operations["sqrt"] <= by_hand_operations["sqrt"]
+    assert not {"gather", "scatter", "while", "select", "compare"} & set(operations)
+    assert not re.search(r"f32\[(\d+,)*3\]|f64\[", text)
+
+
+def test_a_falling_body_never_looks_its_mass_up():
+    def arguments(*parts):
+        text, _, _ = compiled_scene(methods.verlet, *parts, mass=np.linspace(1, 2, 64))
+        return re.search(r"^ENTRY .*$", text, re.MULTILINE)[0]
+
+    assert "mass" not in arguments(forces.Gravity(), forces.RotatingFrame(1.0))
+    assert "mass" in arguments(forces.Gravity(), forces.StokesDrag(1.0))
+
+
+def test_a_whole_run_adds_the_loop_and_the_frames_and_nothing_else():
+    scene = Scene(Particles(jnp.asarray(X), jnp.asarray(V)), forces=(forces.Gravity(),))
+    run = lambda scene: simulate(scene, methods.rk4, dt=0.01, steps=64, save_every=8).state  # noqa: E731
+    text, operations, _ = compiled(run, scene)
+    assert 0 < operations["while"] <= 2
+    assert not {"gather", "scatter", "sqrt", "conditional"} & set(operations)
+    assert not re.search(r"f32\[(\d+,)*3\]|f64\[", text)
+
+
+# import
+
+
+def test_importing_costs_little_and_leaves_diffrax_and_pyplot_for_later():
+    program = """
+import time
+start = time.process_time()
+import jax
+middle = time.process_time()
+import physjax, sys
+end = time.process_time()
+print(middle - start, end - middle, *({"diffrax", "optimistix", "matplotlib.pyplot"} & set(sys.modules)))
+"""
+    runs = [
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT.parent)
+        for _ in range(3)
+    ]
+    told = [run.stdout.split() for run in runs]
+    assert [loaded for _, _, *loaded in told] == [[]] * 3
+    ours, jax_alone = (min(float(costs[i]) for costs in told) for i in (1, 0))
+    assert ours <= max(0.3, 0.5 * jax_alone)  # a busy machine slows both

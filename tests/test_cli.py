@@ -1,0 +1,55 @@
+"""The command line, as a person uses it."""
+
+import subprocess
+import sys
+
+import pytest
+
+from physjax.cli import main
+from physjax.scenes import SCENES
+
+
+def test_chart_writes_picture_csv_and_page(tmp_path, capsys):
+    assert main(["chart", "projectile", "--quick", "--out", str(tmp_path / "new" / "folder")]) == 0
+    folder = tmp_path / "new" / "folder"
+    assert {file.name for file in folder.iterdir()} == {"projectile.png", "projectile.csv", "index.html"}
+    assert (folder / "projectile.png").stat().st_size > 20_000
+    page = (folder / "index.html").read_text()
+    assert "semi_implicit_euler" in page
+    assert "<img" in page
+    printed = capsys.readouterr().out
+    assert "error 1e-04" in printed
+    assert "closed form" in printed
+    assert "jax" in printed
+
+
+def test_unknown_scene_names_the_nearest(tmp_path, capsys):
+    assert main(["chart", "keppler", "--out", str(tmp_path / "out")]) == 2
+    assert "Did you mean kepler" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    assert main(["chart", "kepler", "--out", str(tmp_path / "file")]) == 2
+    captured = capsys.readouterr()
+    assert "cannot write into" in captured.err
+    assert "method" not in captured.err  # no progress bar was begun
+
+
+def test_scenes_lists_the_gallery(capsys):
+    assert main(["scenes"]) == 0
+    printed = capsys.readouterr().out
+    for name in SCENES:
+        assert name in printed
+
+
+def test_python_m_physjax_is_the_same_command():
+    run = subprocess.run([sys.executable, "-m", "physjax", "--help"], capture_output=True, text=True, check=True)
+    assert "chart" in run.stdout
+
+
+def test_no_command_explains_itself(capsys):
+    with pytest.raises(SystemExit):
+        main([])
+    assert "COMMAND" in capsys.readouterr().err
