@@ -1,7 +1,7 @@
 """Game physics in JAX: describe a scene once, run it under any method, batch it, differentiate it."""
 
-from physjax.physics import forces
-from physjax.scene import Field, Force, Particles, Scene, loads
+from physjax.physics import contacts, forces
+from physjax.scene import Contact, Field, Force, Particles, Scene, loads
 from physjax.show import plot
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
@@ -10,12 +10,14 @@ from physjax.study import accuracy, energy, projectile
 from physjax.trajectory import Trajectory
 
 __all__ = [
+    "Contact",
     "Field",
     "Force",
     "Particles",
     "Scene",
     "Trajectory",
     "accuracy",
+    "contacts",
     "energy",
     "forces",
     "loads",

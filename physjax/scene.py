@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import real_array, real_quantity
+from physjax.checks import concrete, real_array, real_quantity
 from physjax.vectors import scale
 
 
@@ -104,6 +104,20 @@ class Field(Force):
         return scale(mass, self.acceleration(t, state, mass))
 
 
+class Contact(eqx.Module):
+    """Something that lanes may not pass. `respond(t, state)` answers every touch, once a step, at its end."""
+
+    couples: ClassVar[bool] = False
+
+    @abstractmethod
+    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+        """Signed distance to the surface [m], > 0 on the legal side."""
+
+    @abstractmethod
+    def respond(self, t: ArrayLike, state: Particles) -> Particles:
+        """The state after a touch; lanes that touch nothing stay as they are."""
+
+
 class Function(eqx.Module):
     """A plain function as part of a scene. It counts as coupling its lanes unless it is said to be independent."""
 
@@ -116,7 +130,7 @@ class Function(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """Everything a run needs but the method: state, mass [kg], forces, and a mask of the lanes that are held in place.
+    """Everything a run needs but the method: state, mass [kg], forces, contacts, and a mask of the lanes that are held.
 
     `mass` is a scalar or per lane. `forces` are library forces or any callable `(t, state, mass) -> newtons`. `pinned`
     is a boolean mask over the lanes. Every number becomes an array of the state's dtype: changing it compiles nothing,
@@ -127,6 +141,7 @@ class Scene(eqx.Module):
     state: Particles
     mass: Float[Array, "..."]
     forces: tuple
+    contacts: tuple
     pinned: Bool[Array, "*lanes"] | None
 
     def __init__(
@@ -134,6 +149,7 @@ class Scene(eqx.Module):
         state: Any,
         mass: Any = 1.0,
         forces: Any = (),
+        contacts: Any = (),
         pinned: Any = None,
     ):
         if not hasattr(state, "checked"):
@@ -154,7 +170,10 @@ class Scene(eqx.Module):
             state = state.held(1 - pinned.astype(dtype))
         self.state = state
         self.mass = mass
-        self.forces = tuple(_part(force, dtype) for force in _listed(forces))
+        self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
+        self.contacts = tuple(_part("contact", contact, dtype) for contact in _listed("contact", contacts))
+        for contact in self.contacts:
+            _demand_legal(contact, state)
         self.pinned = pinned
 
     @property
@@ -197,8 +216,13 @@ class Scene(eqx.Module):
         return eqx.tree_at(lambda scene: scene.forces, self, forces)
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
-        """The scene a moment later: one step of the method, then each part that remembers advances."""
+        """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
         state = method(self.during(t, dt), t, self.state, dt)
+        for contact in self.contacts:
+            state = contact.respond(t + dt, state)
+        if self.contacts and self.pinned is not None:
+            held = self.pinned[..., None]
+            state = jax.tree.map(lambda now, before: jnp.where(held, before, now), state, self.state)
         forces = list(self.forces)
         for i, force in enumerate(forces):
             if hasattr(force, "advance"):
@@ -230,23 +254,47 @@ def as_module(function: Callable) -> eqx.Module:
     return function if isinstance(function, eqx.Module) else Function(function)
 
 
-def _listed(forces: Any) -> tuple:
-    """The forces as a tuple; a single force given without one is an easy slip and gets an error that says so."""
-    if callable(forces) or not hasattr(forces, "__iter__"):
-        raise TypeError(f"forces: got {type(forces).__name__}, expected a tuple of forces. Write forces=(force,).")
-    return tuple(forces)
+def _listed(kind: str, parts: Any) -> tuple:
+    """The parts as a tuple; a single one given without it is an easy slip and gets an error that says so."""
+    if callable(parts) or not hasattr(parts, "__iter__"):
+        raise TypeError(f"{kind}s: got {type(parts).__name__}, expected a tuple of {kind}s. Write {kind}s=({kind},).")
+    return tuple(parts)
 
 
-def _part(force: Any, dtype: np.dtype) -> eqx.Module:
-    """A force as a pytree whose floating-point numbers have the scene's dtype."""
-    if not callable(force) or isinstance(force, type):
-        raise TypeError(
-            f"forces: got {type(force).__name__} {force!r}, expected a force: a callable (t, state, mass) -> newtons."
-        )
+_EXPECTED = {
+    "force": "a force: a callable (t, state, mass) -> newtons",
+    "contact": "a contact, e.g. contacts.Plane(point=(0, 0), normal=(0, 1))",
+}
+
+
+def _part(kind: str, part: Any, dtype: np.dtype) -> eqx.Module:
+    """A force or contact as a pytree whose floating-point numbers have the scene's dtype."""
+    good = isinstance(part, Contact) if kind == "contact" else callable(part) and not isinstance(part, type)
+    if not good:
+        raise TypeError(f"{kind}s: got {type(part).__name__} {part!r}, expected {_EXPECTED[kind]}.")
     return jax.tree.map(
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf,
-        as_module(force),
+        part if isinstance(part, eqx.Module) else Function(part),
     )
+
+
+def _demand_legal(contact: Contact, state: Particles) -> None:
+    """Raise a ValueError naming the lanes that start on the wrong side of a contact by more than rounding."""
+    gap = concrete(contact.gap(jnp.zeros((), state.dtype), state.position))
+    if gap is None:
+        return
+    rounding = 8 * float(jnp.finfo(state.dtype).eps) * float(np.abs(np.asarray(state.position)).max())
+    if (gap < -rounding).any():
+        lanes = np.argwhere(gap < -rounding)
+        where = (
+            "the particle starts"
+            if not gap.ndim
+            else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
+        )
+        raise ValueError(
+            f"{type(contact).__name__}: {where} on the wrong side, {-gap.min():.3g} m deep; expected gaps >= 0. "
+            "Move them, or put them on the surface: state = contact.respond(0.0, state)."
+        )
 
 
 def _sum(terms: Any) -> Array:

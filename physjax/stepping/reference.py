@@ -75,6 +75,10 @@ def reference(
         raise ValueError(
             "reference: the scene has parts that remember, which an ordinary differential equation has not. Remove them."
         )
+    if scene.contacts:
+        raise ValueError(
+            "reference: the scene has contacts, which an ordinary differential equation has not. Remove them."
+        )
     with jax.enable_x64(True):
         scene = in_dtype(scene, jnp.float64)
         end = jnp.asarray(max(times[-1], 1e-300))
