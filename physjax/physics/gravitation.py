@@ -77,17 +77,16 @@ def _components(x: Array) -> list[Array]:
 
 
 def _over_tiles(add, total, sources: list[Array], strength: Array):
-    """Fold `add(total, sources, strength)` over tiles of the last axis; copies of the last source, of no strength, fill it up."""
+    """Fold `add(total, sources, strength)` over tiles of the last axis; the last is filled up with sources of no strength."""
     count = strength.shape[-1]
     if count <= TILE:
         return add(total, sources, strength)
     missing = -count % TILE
 
-    def tiles(a, **fill):
-        filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)], **fill)
+    def tiles(a):
+        filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)])
         return jnp.moveaxis(filled.reshape((*a.shape[:-1], -1, TILE)), -2, 0)
 
     # recomputing a tile in reverse mode keeps its memory linear too
     body = jax.checkpoint(lambda total, tile: (add(total, *tile), None), prevent_cse=False)
-    # a filler elsewhere, at the origin say, could come so close to a body that its 0/d³ is NaN
-    return lax.scan(body, total, ([tiles(c, mode="edge") for c in sources], tiles(strength)))[0]
+    return lax.scan(body, total, ([tiles(c) for c in sources], tiles(strength)))[0]

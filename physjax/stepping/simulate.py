@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.checks import positive_integer, real_quantity
-from physjax.scene import Scene, as_module
+from physjax.scene import Function, Scene, as_module
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
 
@@ -60,10 +60,10 @@ def simulate(
         raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
     method = as_module(method)
     first_step = jnp.asarray(first_step, jnp.int32)
-    return _rollout(scene, method, dt, first_step, steps // save_every, save_every, record)
+    rollout = _wide_rollout if record is None and _outermost((scene, method, dt, first_step)) else _rollout
+    return rollout(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
-@partial(jax.jit, static_argnames=("frames", "save_every", "record"))
 def _rollout(scene, method, dt, first_step, frames, save_every, record):
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
     changing = _changing(scene, method, dt)
@@ -108,6 +108,25 @@ def _rollout(scene, method, dt, first_step, frames, save_every, record):
         save_every=save_every,
         steps=frames * save_every,
     )
+
+
+_SHAPE = ("frames", "save_every", "record")
+# XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.6 times faster; it can be asked only
+# where no other jit is around the run
+_wide_rollout = jax.jit(_rollout, static_argnames=_SHAPE, compiler_options={"xla_cpu_prefer_vector_width": 512})
+_rollout = jax.jit(_rollout, static_argnames=_SHAPE)
+
+
+def _outermost(run: Any) -> bool:
+    """Whether a run on a CPU is compiled for itself: nothing in it is traced, nor can a plain function in it hide a tracer."""
+    modules = jax.tree.leaves(run, is_leaf=lambda part: isinstance(part, Function | jax.core.Tracer))
+    hidden = any(isinstance(m, jax.core.Tracer) or (isinstance(m, Function) and not _ours(m)) for m in modules)
+    return not hidden and jax.default_backend() == "cpu" and not isinstance(jnp.zeros(()), jax.core.Tracer)
+
+
+def _ours(module: Function) -> bool:
+    """Whether a wrapped function is a method that makes promises, which closes over nothing."""
+    return hasattr(module.function, "promises")
 
 
 def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:

@@ -194,11 +194,11 @@ def least_speed(distance: ArrayLike, rise: ArrayLike, *, g: ArrayLike = 9.8) -> 
     return LeastSpeed(speed, jnp.where(behind, math.pi - theta, theta))
 
 
-def _numbers(**given: ArrayLike) -> list[Array]:
+def _numbers(**given: ArrayLike) -> tuple[Array, ...]:
     """The numbers as arrays of one shape, bad ones refused where they are concrete and NaN where they are traced."""
     arrays = {name: _number(name, value) for name, value in given.items()}
     try:
-        return jnp.broadcast_arrays(*arrays.values())
+        return tuple(jnp.broadcast_arrays(*arrays.values()))  # a list in older versions
     except ValueError as error:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
         raise ValueError(f"projectile: got {shapes}, expected shapes that broadcast together.") from error

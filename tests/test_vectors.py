@@ -1,0 +1,153 @@
+"""The vector helpers equal NumPy at any number of lanes, and their derivatives are right, also where the formulas are not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physjax.vectors import cross, dot, norm, over, scale, spin, turn_left, unit, upward
+
+# large and odd sizes, because jax 0.10.2 returned wrong rows for some of them on CPU (jax issue 39103)
+LANES = pytest.mark.parametrize("n", [1000, 16385, 32769, 50001])
+
+
+@jax.jit
+def everything(a, b, flat, number, vector, amount):
+    """Every helper at once, so that a size costs one compilation."""
+    return {
+        "dot": dot(a, b),
+        "dot in the plane": dot(flat, turn_left(flat) + flat),
+        "norm": norm(a),
+        "unit": unit(a),
+        "cross": cross(a, b),
+        "spin, one vector": spin(vector, b),
+        "spin, a vector per lane": spin(a, b),
+        "spin, a number per lane": spin(number, flat),
+        "turn_left": turn_left(flat),
+        "scale": scale(number, a),
+        "scale by one number": scale(amount, a),
+        "over": over(vector, a),
+        "upward": upward(number, 2, a),
+        "upward, one number": upward(amount, 1, flat),
+    }
+
+
+def expected(a, b, flat, number, vector, amount):
+    """The same by NumPy in float64, each with the sum of the magnitudes that its rounding errors are shares of."""
+    length, size = np.linalg.norm(a, axis=-1), np.linalg.norm
+    left = np.stack([-flat[:, 1], flat[:, 0]], axis=-1)
+    products = (size(a, axis=-1) * size(b, axis=-1))[:, None]
+    axis = np.zeros_like(a)
+    axis[:, 2] = number
+    return {
+        "dot": (np.sum(a * b, axis=-1), products[:, 0]),
+        "dot in the plane": (np.sum(flat * flat, axis=-1), 2 * np.sum(flat * flat, axis=-1)),
+        "norm": (length, length),
+        "unit": (a / length[:, None], 1.0),
+        "cross": (np.cross(a, b), products),
+        "spin, one vector": (np.cross(vector[None], b), size(vector) * size(b, axis=-1)[:, None]),
+        "spin, a vector per lane": (np.cross(a, b), products),
+        "spin, a number per lane": (number[:, None] * left, np.abs(number[:, None] * left)),
+        "turn_left": (left, 0.0),
+        "scale": (number[:, None] * a, np.abs(number[:, None] * a)),
+        "scale by one number": (amount * a, np.abs(amount * a)),
+        "over": (np.broadcast_to(vector, a.shape), 0.0),
+        "upward": (axis, 0.0),
+        "upward, one number": (np.broadcast_to([0.0, amount], flat.shape), 0.0),
+    }
+
+
+def test_the_table_of_expected_values_misses_no_helper():
+    import physjax.vectors as module
+
+    public = {name for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
+    named = {word.strip(",") for name in expected(*some(2, np.float64)) for word in name.split()[:1]}
+    assert {name for name in public if not name.startswith("_")} == named
+
+
+def some(n, dtype, seed=0):
+    """Arguments for all helpers, lanes of magnitudes from 1e-6 to 1e6, and no zero vector."""
+    rng = np.random.default_rng(seed)
+
+    def numbers(*shape):
+        lanes = shape[:1] + (1,) * (len(shape) - 1)
+        return np.asarray(rng.normal(size=shape) * 10.0 ** rng.uniform(-6, 6, size=lanes), dtype)
+
+    return numbers(n, 3), numbers(n, 3), numbers(n, 2), numbers(n), numbers(3), numbers()
+
+
+def check_against_numpy(found, arguments):
+    """Each component is within four roundings of the exact one."""
+    eps = np.finfo(arguments[0].dtype).eps
+    wanted = expected(*(a.astype(float) for a in arguments))
+    assert found.keys() == wanted.keys()
+    for name, (value, magnitude) in wanted.items():
+        assert found[name].dtype == arguments[0].dtype, name
+        assert found[name].shape == value.shape, name
+        assert np.all(np.abs(np.asarray(found[name], float) - value) <= 4 * eps * magnitude), name
+
+
+@LANES
+def test_every_helper_equals_numpy(n, precision):
+    arguments = some(n, precision.dtype)
+    check_against_numpy(everything(*map(jnp.asarray, arguments)), arguments)
+
+
+def test_under_vmap_too(precision):
+    arguments = some(1000, precision.dtype)
+    lane_by_lane = jax.vmap(everything, in_axes=(0, 0, 0, 0, None, None))
+    check_against_numpy(lane_by_lane(*map(jnp.asarray, arguments)), arguments)
+
+
+def test_a_number_per_scene_scales_all_its_lanes():
+    array = jnp.arange(12.0).reshape(2, 3, 2)
+    np.testing.assert_array_equal(scale(jnp.asarray([2.0, -1.0]), array), array * np.array([2.0, -1.0])[:, None, None])
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_directions_have_length_one_however_short_or_long_the_vector(dim):
+    v = jnp.outer(10.0 ** jnp.linspace(-150, 150, 61), jnp.arange(1.0, dim + 1))
+    np.testing.assert_allclose(norm(unit(v)), 1.0, rtol=4e-16, atol=0)
+
+
+@pytest.mark.parametrize("function", [norm, unit], ids=["norm", "unit"])
+def test_value_and_derivatives_at_zero_are_zero_to_third_order(function, precision):
+    first, first_reverse = jax.jacfwd(function), jax.jacrev(function)
+    second, third = jax.jacfwd(first_reverse), jax.jacfwd(jax.jacfwd(first))
+    every = jax.jit(lambda v: [f(v) for f in (function, first, first_reverse, second, third)])
+    for value in every(jnp.zeros(3, precision.dtype)):
+        assert value.dtype == precision.dtype
+        np.testing.assert_array_equal(value, np.zeros_like(value))
+
+
+def test_a_lane_at_zero_leaves_the_gradient_of_its_neighbours_alone():
+    v = jnp.asarray([[0.0, 0.0], [3.0, -4.0]])
+    gradient = jax.jit(jax.grad(lambda v: jnp.sum(norm(v))))(v)
+    np.testing.assert_allclose(gradient, [[0, 0], [0.6, -0.8]], rtol=1e-15, atol=0)
+
+
+@pytest.mark.parametrize("function", [norm, unit], ids=["norm", "unit"])
+def test_derivatives_equal_finite_differences(function):
+    v, h = np.array([0.3, -1.2, 0.7]), 1e-5
+    ahead, behind = (np.asarray(function(jnp.asarray(v + step))) for step in (h * np.eye(3), -h * np.eye(3)))
+    differences = (ahead - behind).T / (2 * h)
+    for jacobian in jax.jit(lambda v: (jax.jacfwd(function)(v), jax.jacrev(function)(v)))(jnp.asarray(v)):
+        np.testing.assert_allclose(jacobian, differences, rtol=0, atol=1e-10)
+
+
+def test_the_second_derivative_of_the_norm_is_the_projector_over_the_length():
+    v = np.array([0.3, -1.2, 0.7])
+    length = np.linalg.norm(v)
+    projector = (np.eye(3) - np.outer(v, v) / length**2) / length
+    np.testing.assert_allclose(jax.jit(jax.hessian(norm))(jnp.asarray(v)), projector, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (4, 1)])
+def test_a_vector_of_another_length_is_not_spread_over_the_components(shape):
+    with pytest.raises(ValueError, match=r"got a vector of shape .* expected \(3,\) for all lanes or \(4, 3\)"):
+        over(jnp.ones(shape), jnp.zeros((4, 3)))
+
+
+def test_an_axis_that_is_not_there_is_a_plain_error():
+    with pytest.raises(ValueError, match=r"up: got axis 1, .* 1 components.*Give an axis from 0 to 0"):
+        upward(jnp.asarray(9.8), 1, jnp.zeros((4, 1)))
