@@ -1,0 +1,376 @@
+"""What every benchmark shares: the machine, timing side by side, counting compilations, tables, charts, whole files.
+
+Contenders take turns in one process, one round after the other, so that whatever else the machine does meets all of
+them. A turn lasts half a second for everyone, so that no short call slips through a gap that a long one cannot, and
+begins with a call that does not count: it pays for what the one before left behind (memory to return, cold caches).
+The very first call, which compiles, is kept apart. Times are those of finished work.
+"""
+
+import argparse
+import ctypes
+import importlib
+import json
+import math
+import os
+import platform
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what is measured is this checkout, installed or not
+
+import jax
+
+import physjax
+from physjax.files import replacing, writable_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "numpy", "numba", "warp-lang")
+TURN = 0.5
+"""Seconds of a turn."""
+COLOURS = {"physjax": "#0072B2", "other JAX code": "#E69F00", "without JAX": "#999999"}
+"""By family of contenders, from the palette of Okabe and Ito, which colour-blind readers tell apart, also in grey."""
+
+jax.config.update("jax_enable_compilation_cache", False)  # a cache on disk would hide what compiling costs
+_compiled: list[float] = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **_: _compiled.append(seconds) if event.endswith("backend_compile_duration") else None
+)
+
+
+class Timing(NamedTuple):
+    """Seconds of the first call, of XLA's compiler within it, of a call in every turn, and processor seconds of those."""
+
+    first: float
+    compiling: float
+    seconds: tuple[float, ...]
+    busy: tuple[float, ...]
+
+    @property
+    def least(self) -> float:
+        """A call in the least disturbed turn [s]."""
+        return min(self.seconds)
+
+    @property
+    def median(self) -> float:
+        """A call in an ordinary turn [s]."""
+        return statistics.median(self.seconds)
+
+    @property
+    def cores(self) -> float:
+        """Cores in use on average: well below 1 for work on the CPU means that something else had the machine."""
+        return sum(self.busy) / sum(self.seconds)
+
+
+class Bar(NamedTuple):
+    """A measured number and what it must be."""
+
+    name: str
+    measured: float
+    relation: str
+    wanted: float
+
+    @property
+    def met(self) -> bool:
+        """Whether it is."""
+        return self.measured >= self.wanted if self.relation == ">=" else self.measured <= self.wanted
+
+
+@contextmanager
+def compilations() -> Iterator[list[float]]:
+    """Seconds of every compilation by XLA inside the block, in a list that is filled when the block ends."""
+    start, seen = len(_compiled), []
+    yield seen
+    seen.extend(_compiled[start:])
+
+
+class Missing(Exception):
+    """Something that this machine lacks, in plain words."""
+
+
+def optional(module: str, package: str | None = None) -> Any:
+    """An installed module, or `Missing` with what to install."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise Missing(f"not installed (pip install {package or module})") from error
+
+
+def c_library(source: str) -> ctypes.CDLL:
+    """C code compiled for this processor, as fast as the compiler can; `Missing` without a compiler."""
+    flags = ["-O3", "-march=native", "-ffast-math", *(["-mprefer-vector-width=512"] if avx512() else [])]
+    with tempfile.TemporaryDirectory() as folder:
+        code, binary = Path(folder) / "code.c", Path(folder) / "code.so"
+        code.write_text(source)
+        command = ["cc", *flags, "-shared", "-fPIC", "-o", str(binary), str(code), "-lm"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True)
+        except FileNotFoundError as error:
+            raise Missing("there is no C compiler called cc") from error
+        except subprocess.CalledProcessError as error:
+            raise Missing(f"{' '.join(command[:-5])} failed: {error.stderr.strip()[-300:]}") from error
+        return ctypes.CDLL(str(binary))
+
+
+def side_by_side(
+    contenders: Mapping[str, Callable[[], Any]],
+    repeats: int,
+    check: Callable[[str, Any], None] = lambda name, found: None,
+) -> tuple[dict[str, Timing], dict[str, str]]:
+    """Let all contenders take a turn in each of `repeats` rounds, after a first call whose result is `check`ed.
+
+    Nothing is timed before all are checked. Returns the times, and the reasons of those whose first call failed.
+    """
+    firsts, failed = {}, {}
+    for name, run in contenders.items():
+        start = time.perf_counter()
+        with compilations() as compiling:
+            try:
+                found = jax.block_until_ready(run())
+            except Exception as error:
+                failed[name] = f"{type(error).__name__}: {str(error)[-300:]}"
+                continue
+        firsts[name] = time.perf_counter() - start, sum(compiling)
+        check(name, found)
+        tell(f"  {name}: first call {firsts[name][0]:.2f} s")
+    taken = {name: [] for name in firsts}
+    for _ in range(repeats):
+        for name, times in taken.items():
+            times.append(turn(contenders[name]))
+    return {name: Timing(*firsts[name], *zip(*times, strict=True)) for name, times in taken.items()}, failed
+
+
+def turn(run: Callable[[], Any]) -> tuple[float, float]:
+    """Mean seconds and processor seconds of a call, over calls that fill a turn after one that does not count.
+
+    A call that fills the turn by itself is not repeated.
+    """
+    calls, busy = 0, time.process_time()
+    warming = stopwatch(run)
+    if warming >= TURN:
+        return warming, time.process_time() - busy
+    start, busy = time.perf_counter(), time.process_time()
+    while calls == 0 or time.perf_counter() - start < TURN:
+        jax.block_until_ready(run())
+        calls += 1
+    return (time.perf_counter() - start) / calls, (time.process_time() - busy) / calls
+
+
+def stopwatch(run: Callable[[], Any]) -> float:
+    """Seconds until the result of a call is there [s]."""
+    start = time.perf_counter()
+    jax.block_until_ready(run())
+    return time.perf_counter() - start
+
+
+def import_seconds(modules: Sequence[str], repeats: int) -> dict[str, float]:
+    """What importing each module costs in a fresh process, the least of the repeats, taken in turn [s]."""
+    seconds = {module: [] for module in modules}
+    for _ in range(repeats):
+        for module in modules:
+            code = f"import time; t = time.perf_counter(); import {module}; print(time.perf_counter() - t)"
+            done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True)
+            seconds[module].append(float(done.stdout))
+    return {module: min(taken) for module, taken in seconds.items()}
+
+
+def temporary_bytes(function: Any, *arguments: Any) -> int:
+    """Memory that a compiled function needs besides its arguments and results [bytes]."""
+    return function.lower(*arguments).compile().memory_analysis().temp_size_in_bytes
+
+
+def machine() -> dict[str, Any]:
+    """What was measured on: device, processor, cores this process may use, load, versions, flags."""
+    device = jax.devices()[0]
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    return {
+        "when": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "backend": jax.default_backend(),
+        "device": device.device_kind,
+        "processor": _cpuinfo("model name") or platform.processor() or platform.machine(),
+        "avx512": avx512(),
+        "cores": os.cpu_count(),
+        "cores_used": len(cores) if cores else None,
+        "affinity": cores,
+        "load_average": os.getloadavg() if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "versions": {"physjax": physjax.__version__} | {name: found for name in PACKAGES if (found := _version(name))},
+        "compiler": _compiler(),
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
+    }
+
+
+def caption(about: Mapping[str, Any]) -> str:
+    """The machine in a line."""
+    what = about["processor"] if about["backend"] == "cpu" else f"{about['device']}, host {about['processor']}"
+    used = f"{about['cores_used']} of {about['cores']} cores" if about["cores_used"] else f"{about['cores']} cores"
+    return f"{what}, {used}; jax {jax.__version__}, Python {about['python']}, {about['when']}"
+
+
+def avx512() -> bool:
+    """Whether the processor has 512-bit vectors."""
+    return "avx512f" in (_cpuinfo("flags") or "").split()
+
+
+def options(about: str) -> tuple[bool, Path]:
+    """The command line: whether to be quick, and the folder of the results, tried before the work."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small sizes: shows that everything runs, proves nothing")
+    parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="where results go (%(default)s)")
+    given = parser.parse_args()
+    try:
+        return given.quick, writable_folder(given.out)
+    except OSError as error:
+        parser.error(str(error))
+
+
+def result_path(folder: Path, name: str, quick: bool, ending: str) -> Path:
+    """`<name>-<device>-jax<version>.<ending>`; a quick run, which proves nothing, is marked as such."""
+    device = re.sub(r"[^a-z0-9]+", "-", jax.devices()[0].device_kind.lower()).strip("-")
+    return folder / f"{name}-{device}-jax{jax.__version__}{'-quick' if quick else ''}.{ending}"
+
+
+def write_json(path: Path, record: Mapping[str, Any]) -> None:
+    """The record as a file that is whole or absent."""
+    with replacing(path) as file:
+        json.dump(record, file, indent=1, ensure_ascii=False)
+        file.write("\n")
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """A table whose first column is text and whose others are numbers."""
+    cells = [list(head), *([cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    print(f"\n{title}")
+    for n, row in enumerate(cells):
+        print(
+            "  "
+            + "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        )
+        if n == 0:
+            print("  " + "  ".join("-" * width for width in widths))
+
+
+def row(name: str, family: str, work: float, timing: Timing) -> dict[str, Any]:
+    """A contender's result: its rate in units of `work` a second, the best and the median, and all its times [s]."""
+    return {
+        "name": name,
+        "family": family,
+        "rate": work / timing.least,
+        "median_rate": work / timing.median,
+        "first_call_s": timing.first,
+        "compile_s": timing.compiling,
+        "cores": timing.cores,
+        "seconds": timing.seconds,
+        "busy_seconds": timing.busy,
+    }
+
+
+def print_rates(title: str, unit: str, rows: Sequence[Mapping[str, Any]], ours: str) -> None:
+    """Contenders by rate, how many times faster `ours` is than each, cores in use, and what the first call cost.
+
+    One core should read 1; less means that something else had the machine, and short calls then gain on long ones.
+    """
+    own = next(row["rate"] for row in rows if row["name"] == ours)
+    lines = [
+        [
+            row["name"],
+            row["rate"],
+            row["median_rate"],
+            own / row["rate"],
+            row["cores"],
+            row["first_call_s"],
+            row["compile_s"],
+        ]
+        for row in sorted(rows, key=lambda row: -row["rate"])
+    ]
+    head = ["", "best", "median", f"{ours} / it", "cores", "first call [s]", "XLA compile [s]"]
+    print_table(f"{title} [{unit}]", head, lines)
+
+
+def print_bars(bars: Sequence[Bar], quick: bool) -> None:
+    """What was promised, what was measured."""
+    verdicts = ["-" if quick else "met" if bar.met else "MISSED" for bar in bars]
+    lines = [
+        [bar.name, bar.measured, f"{bar.relation} {bar.wanted:g}", verdict]
+        for bar, verdict in zip(bars, verdicts, strict=True)
+    ]
+    print_table("Bars" + (", not judged in a quick run" if quick else ""), ["", "measured", "wanted", ""], lines)
+
+
+def bar_chart(path: Path, panels: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], foot: str) -> None:
+    """Horizontal bars on a logarithmic axis: a panel is (title, axis label, rows as made by `row`).
+
+    Bars are the best of the turns, ticks their median. The file is whole or absent.
+    """
+    from matplotlib.figure import Figure  # no pyplot: no display and no global state
+    from matplotlib.patches import Patch
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    counts = [len(rows) for _, _, rows in panels]
+    figure = Figure(figsize=(10.5, 1.9 + 0.36 * sum(counts) + 0.6 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, height_ratios=counts, squeeze=False)[:, 0]
+    for axis, (title, label, rows) in zip(axes, panels, strict=True):
+        rows = sorted(rows, key=lambda row: row["rate"])
+        names, best = [row["name"] for row in rows], [row["rate"] for row in rows]
+        axis.barh(names, best, color=[COLOURS[row["family"]] for row in rows], height=0.72)
+        axis.scatter([row["median_rate"] for row in rows], names, marker="|", s=90, color="black", zorder=3)
+        axis.set_xscale("log")
+        axis.set_xlim(10 ** math.floor(math.log10(min(best) / 1.2)), max(best) * 2.2)
+        axis.bar_label(axis.containers[0], labels=[_short(value) for value in best], fontsize=9, padding=3)
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.set_title(title, loc="left", fontsize=11)
+        axis.set_xlabel(label)
+        axis.tick_params(axis="y", length=0)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(axis="x", which="major", alpha=0.3)
+        axis.set_axisbelow(True)
+    keys = [Patch(color=colour, label=family) for family, colour in COLOURS.items()]
+    figure.legend(handles=keys, loc="outside upper right", ncols=len(keys), frameon=False)
+    figure.supxlabel(f"{foot}\nbar: best of the turns, tick: their median", fontsize=8, x=0.01, ha="left")
+    with replacing(path, "wb") as file:
+        figure.savefig(file, format="png", dpi=150)
+
+
+def tell(what: str) -> None:
+    """Progress, apart from the results."""
+    print(what, file=sys.stderr, flush=True)
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _cpuinfo(field: str) -> str | None:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return None
+    found = re.search(rf"^{field}\s*:\s*(.*)$", text, re.MULTILINE)
+    return found[1].strip() if found else None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _compiler() -> str | None:
+    try:
+        return subprocess.run(["cc", "--version"], capture_output=True, text=True, check=True).stdout.splitlines()[0]
+    except (OSError, subprocess.CalledProcessError, IndexError):
+        return None
