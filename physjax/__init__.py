@@ -1,13 +1,19 @@
 """Game physics in JAX: describe a scene once, run it under any method, batch it, differentiate it."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from physjax.physics import contacts, forces
 from physjax.scene import Contact, Field, Force, Particles, Scene, loads
-from physjax.show import plot
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
 from physjax.stepping.simulate import simulate
-from physjax.study import accuracy, energy, projectile
 from physjax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from physjax import scenes
+    from physjax.show import plot
+    from physjax.study import accuracy, energy, projectile
 
 __all__ = [
     "Contact",
@@ -26,6 +32,26 @@ __all__ = [
     "plot",
     "projectile",
     "reference",
+    "scenes",
     "simulate",
 ]
 __version__ = "0.1.0"
+
+# what is asked of a run and shown of it is loaded when first named: importing physjax costs little more than importing jax
+_LATER = {
+    "accuracy": "physjax.study.accuracy",
+    "energy": "physjax.study.energy",
+    "plot": "physjax.show.plot",
+    "projectile": "physjax.study.projectile",
+    "scenes": "physjax.scenes",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name in _LATER:
+        return import_module(_LATER[name])
+    raise AttributeError(f"module 'physjax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -23,7 +23,7 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str |
     return "\n".join([line(headers), "  ".join("-" * width for width in widths), *map(line, rows)])
 
 
-def seconds_text(seconds: float) -> str:
+def seconds_text(seconds: int | float) -> str:
     """A time with a unit that keeps it readable, from µs to days."""
     for unit, size in (("d", 86400.0), ("s", 1.0), ("ms", 1e-3)):
         if seconds >= size:

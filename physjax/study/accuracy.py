@@ -48,7 +48,7 @@ QUICK = Budget(seconds=0.01, repeats=2, refinement=2.0)
 def work_precision(
     problem: Problem | Scene,
     methods: Sequence[Callable] | None = None,
-    dts: ArrayLike | None = None,
+    dts: ArrayLike | Sequence[float] | None = None,
     *,
     duration: float | None = None,
     exact: Callable | None = None,

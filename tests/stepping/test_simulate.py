@@ -1,6 +1,7 @@
 """The loop: frames and time, resuming, one compilation, batches, derivatives, memory, and plain words for bad numbers."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -332,3 +333,20 @@ def test_a_scene_and_a_method_are_needed(unannotated):
         simulate(balls().state, methods.euler, dt=0.1, steps=1)
     with pytest.raises(TypeError, match=r"got the method 'rk4', expected a function .* e\.g\. methods\.rk4"):
         simulate(balls(), "rk4", dt=0.1, steps=1)
+
+
+def test_plain_functions_may_close_over_what_is_differentiated():
+    def stretched(system, t, state, dt, factor):
+        return methods.euler(system, t, state, factor * dt)
+
+    def swing(k):
+        scene = Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(lambda t, state, mass: -k * state.position,))
+        slow = lambda system, t, state, dt: stretched(system, t, state, dt, k)  # noqa: E731
+        run = partial(simulate, dt=0.1, steps=5)
+        told = run(scene, methods.rk4, record=lambda t, state: k * state.position).recorded
+        return told[-1, 0] + run(scene, slow).position[-1, 0]
+
+    h = 1e-6
+    central = (swing(2.0 + h) - swing(2.0 - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(swing)(2.0), central, rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(swing)(2.0), swing(2.0), rtol=1e-12)
