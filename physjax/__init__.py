@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from physjax.physics import contacts, forces
+from physjax.physics import forces
 from physjax.scene import Contact, Field, Force, Particles, Scene, loads
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
@@ -12,6 +12,7 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from physjax import scenes
+    from physjax.physics import contacts
     from physjax.show import plot
     from physjax.study import accuracy, energy, projectile
 
@@ -37,9 +38,10 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 
-# what is asked of a run and shown of it is loaded when first named: importing physjax costs little more than importing jax
+# loaded when first named: what not every run needs should not make `import physjax` slower
 _LATER = {
     "accuracy": "physjax.study.accuracy",
+    "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",

@@ -16,7 +16,7 @@ from physjax.scene import Function, Scene
 
 BLOCK = 8192
 """Lanes in a block: 200 kB of state in 3-D and float32, which leaves room for the stages of a step in a 1 MB cache."""
-SMALLEST = 16 * BLOCK
+SMALLEST = 6 * BLOCK
 """Fewer lanes than this fit a cache as they are."""
 FEWEST_STEPS = 8
 """Fewer steps between frames do not pay for cutting."""
