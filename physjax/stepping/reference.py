@@ -36,8 +36,8 @@ class _VectorField(eqx.Module):
 def ode_term(scene: Scene) -> "diffrax.ODETerm":
     """The scene as a diffrax `ODETerm` over its state, to be used with any diffrax solver: `y0=scene.state`.
 
-    The equations of motion between steps; parts that remember do not advance. Forces that jump at known times (`Kick`)
-    need `ClipStepSizeController(jump_ts=discontinuities(scene))`.
+    The equations of motion between steps: contacts are not in it, and parts that remember do not advance. Forces that
+    jump at known times (`Kick`) need `ClipStepSizeController(jump_ts=discontinuities(scene))`.
     """
     import diffrax
 

@@ -65,12 +65,16 @@ def work_precision(
     `problem` is a gallery problem, or a scene with its `duration` [s] and, if known, its closed form `exact(times)`.
     `methods`: all of the registry by default. `dts` [s]: from coarse to fine within the budget by default; each is
     rounded so that a whole number of steps fits between the moments compared. `rivals`: diffrax solvers, run adaptively
-    at the `tolerances`; Tsit5 and Dopri8 by default. The truth is the closed form where there is one, else diffrax's
-    Dopri8 at 1e-13, whose own error is the floor of the result. Compiles once per method. `progress(what)` is called
-    before each method. Raises ValueError for a missing duration or bad steps.
+    at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts. The truth is the closed form
+    where there is one, else diffrax's Dopri8 at 1e-13, whose own error is the floor of the result. Compiles once per
+    method. `progress(what)` is called before each method. Raises ValueError for a missing duration or bad steps.
     """
     problem = _as_problem(problem, duration, exact, conserved)
     methods = list(METHODS.values()) if methods is None else list(methods)
+    if rivals is None:
+        rivals = () if problem.scene.contacts else default_rivals()
+    if problem.scene.contacts and rivals:
+        raise ValueError("work_precision: the scene has contacts, through which diffrax would pass. Give rivals=().")
     if dts is not None:
         dts = np.atleast_1d(np.asarray(real_quantity("dts [s]", dts, above=0.0), float))
     with jax.enable_x64(True):
@@ -83,7 +87,7 @@ def work_precision(
         for method in methods:
             progress(_name(method))
             runs += _method_runs(problem, scene, method, dts, measure, budget)
-        for solver in default_rivals() if rivals is None else rivals:
+        for solver in rivals:
             progress(f"diffrax {type(solver).__name__}")
             runs += _rival_runs(problem, scene, solver, tolerances, measure, budget)
     velocity_dependent = _depends_on_velocity(problem.scene)
@@ -97,7 +101,6 @@ def work_precision(
         conserved=tuple(quantity.name for quantity in problem.conserved),
         dtype=np.dtype(dtype).name,
         path=(_detailed(problem), path.position),
-        couples=problem.scene.couples,
     )
 
 
@@ -105,13 +108,11 @@ class _Errors:
     """Errors of a run against the truth, relative to the extent of the path, the worst lane and moment."""
 
     def __init__(self, problem: Problem, scene: Scene, truth: Particles):
-        lanes = tuple(range(1, truth.position.ndim - 1))
         away = np.sqrt(np.sum((truth.position - truth.position[0]) ** 2, axis=-1))
         nodes = (0, -1) if scene.couples else (0,)
         extent = away.max(axis=nodes, keepdims=True)[0]
         self.extent = np.where(extent > 0, extent, 1.0)
-        self.truth, self.lanes = truth, lanes
-        self.conserved = problem.conserved
+        self.truth = truth
         self.drift = jax.jit(partial(_drifts, quantities=problem.conserved))
         self.scene, self.times = scene, jnp.asarray(problem.times)
 

@@ -54,7 +54,6 @@ class WorkPrecision(NamedTuple):
     conserved: tuple[str, ...]
     dtype: str
     path: tuple[np.ndarray, np.ndarray]
-    couples: bool
 
     @property
     def methods(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, forces, methods
+from physjax import Particles, Scene, contacts, forces, methods
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
 from physjax.study import accuracy
@@ -144,6 +144,22 @@ def test_bad_input_is_refused_in_plain_words(arguments, message):
     scene = Scene(Particles(jnp.zeros(2), jnp.ones(2)), forces=(forces.Gravity(),))
     with pytest.raises((TypeError, ValueError), match=message):
         work_precision(**({"problem": scene} | arguments))
+
+
+def test_diffrax_is_no_rival_where_it_would_fall_through_the_floor():
+    floor = contacts.Plane((0.0,), (1.0,))
+    ball = Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(forces.Gravity(up=0),), contacts=(floor,))
+
+    def exact(t):
+        fall = np.sqrt(2 / 9.8)
+        since = np.where(t < fall, t, t - 2 * fall)[:, None]  # an elastic bounce: the same parabola again
+        return Particles(1 - 4.9 * since**2, -9.8 * since)
+
+    study = work_precision(ball, [methods.verlet], [1e-3, 1e-4], duration=1.0, exact=exact, budget=FEW)
+    assert study.methods == ("verlet",)
+    assert study.runs[-1].path_error < 2e-3
+    with pytest.raises(ValueError, match="has contacts"):
+        work_precision(ball, [methods.verlet], [1e-3], duration=1.0, exact=exact, rivals=accuracy.default_rivals())
 
 
 def test_rivals_can_be_chosen():
