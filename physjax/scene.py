@@ -7,6 +7,7 @@ earlier axes count scenes. A per-lane number is a scalar or has the shape of the
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -105,9 +106,14 @@ class Field(Force):
 
 
 class Contact(eqx.Module):
-    """Something that lanes may not pass. `respond(t, state)` answers every touch, once a step, at its end."""
+    """Something that lanes may not pass. `respond(t, state)` answers every touch, once a step, at its end.
 
-    couples: ClassVar[bool] = False
+    A `response(motion, scene, t, dt) -> scene` other than `project` decides otherwise when touches are answered;
+    `memory` names the arrays that it changes.
+    """
+
+    response: ClassVar[Callable | None] = None
+    memory: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
@@ -116,6 +122,30 @@ class Contact(eqx.Module):
     @abstractmethod
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after a touch; lanes that touch nothing stay as they are."""
+
+    def changes(self) -> "Contact":
+        """The contact with True in place of each array that a step changes, False elsewhere."""
+        mask = jax.tree.map(lambda _: False, self)
+        where = lambda contact: [getattr(contact, name) for name in self.memory]  # noqa: E731
+        return eqx.tree_at(where, mask, [True] * len(self.memory)) if self.memory else mask
+
+    def prepared(self, state: Particles, couples: bool) -> "Contact":
+        """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
+        return self
+
+
+def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "Scene":
+    """The lecture's response: step as if nothing were there, then put back and turn around what went in.
+
+    Cheap and robust, first order in dt: a bounce happens at the end of the step, not when the surface was met, and a
+    lane that crosses a thin obstacle within one step is not seen.
+    """
+    scene = motion(scene, t, dt)
+    state = scene.state
+    for contact in scene.contacts:
+        if (contact.response or project) is project:
+            state = contact.respond(t + dt, state)
+    return scene.having(state=state)
 
 
 class Function(eqx.Module):
@@ -143,6 +173,7 @@ class Scene(eqx.Module):
     forces: tuple
     contacts: tuple
     pinned: Bool[Array, "*lanes"] | None
+    reaction: Callable | None = eqx.field(init=False)
 
     def __init__(
         self,
@@ -171,10 +202,12 @@ class Scene(eqx.Module):
         self.state = state
         self.mass = mass
         self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
-        self.contacts = tuple(_part("contact", contact, dtype) for contact in _listed("contact", contacts))
-        for contact in self.contacts:
+        contacts = [_part("contact", contact, dtype) for contact in _listed("contact", contacts)]
+        for contact in contacts:
             _demand_legal(contact, state)
+        self.contacts = tuple(contact.prepared(state, self.couples) for contact in contacts)
         self.pinned = pinned
+        self.reaction = None
 
     @property
     def couples(self) -> bool:
@@ -196,7 +229,8 @@ class Scene(eqx.Module):
             total.append(_sum(fields) if free is None else scale(free, _sum(fields)))
         if newtons:
             total.append(scale((1.0 if free is None else free) / self.mass, _sum(newtons)))
-        return _sum(total) if total else jnp.zeros_like(state.velocity)
+        acceleration = _sum(total) if total else jnp.zeros_like(state.velocity)
+        return acceleration if self.reaction is None else self.reaction(t, state, acceleration)
 
     def rate(self, t: ArrayLike, state: Particles) -> Particles:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
@@ -217,23 +251,41 @@ class Scene(eqx.Module):
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
-        state = method(self.during(t, dt), t, self.state, dt)
-        for contact in self.contacts:
-            state = contact.respond(t + dt, state)
+        motion = partial(_free_motion, method)
+        # what is answered at the end of the step comes last
+        for response in sorted({contact.response or project for contact in self.contacts}, key=lambda r: r is project):
+            motion = partial(response, motion)
+        after = motion(self, t, dt)
+        state = after.state
         if self.contacts and self.pinned is not None:
             held = self.pinned[..., None]
             state = jax.tree.map(lambda now, before: jnp.where(held, before, now), state, self.state)
-        forces = list(self.forces)
+        return after.having(state=state).advanced(t, dt)
+
+    def advanced(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
+        """The scene after each force that remembers has advanced by a step from t to t + dt."""
+        forces, state = list(self.forces), self.state
         for i, force in enumerate(forces):
             if hasattr(force, "advance"):
                 forces[i], state = force.advance(t, dt, state)
-        return eqx.tree_at(lambda scene: (scene.state, scene.forces), self, (state, tuple(forces)))
+        return self.having(state=state, forces=tuple(forces))
+
+    def having(self, **parts: Any) -> "Scene":
+        """The scene with some of its parts replaced, unchecked."""
+        names = list(parts)
+        where = lambda scene: [getattr(scene, name) for name in names]  # noqa: E731
+        return eqx.tree_at(where, self, list(parts.values()), is_leaf=lambda leaf: leaf is None)
 
     def finite(self, state: Particles) -> Bool[Array, "..."]:
         """Whether the state is finite, per lane, or per scene where lanes are coupled."""
         status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
         good = jnp.all(jnp.stack(status), axis=0)
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
+
+
+def _free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+    """A step of the method as if nothing were in the way."""
+    return scene.having(state=method(scene.during(t, dt), t, scene.state, dt))
 
 
 def loads(scene: Scene, t: ArrayLike, state: Particles | None = None, *, per_term: bool = False) -> Any:

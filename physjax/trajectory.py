@@ -23,7 +23,7 @@ class Trajectory(eqx.Module):
     """Frames of a run. `.time` [s] is `(frames,)`; `.state` has a leading axis of frames, frame 0 the start.
 
     `.ok` says whether the state stayed finite, per lane (per scene where lanes are coupled); `.first_bad_step` where it
-    did not. `.parts` are the forces that remember, with the arrays they changed at every frame. `.recorded` replaces
+    did not. `.parts` are the forces and contacts that remember, with the arrays they changed at every frame. `.recorded` replaces
     `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of the run, from which it
     can be resumed.
     """
@@ -123,7 +123,7 @@ class Trajectory(eqx.Module):
         """The pytrees that go into a file, by the name they have there."""
         groups = {"state": self.state, "parts": self.parts, "recorded": self.recorded}
         if self.final_scene is not None:
-            groups |= {"final_state": self.final_scene.state, "final_parts": memories(self.final_scene.forces)}
+            groups |= {"final_state": self.final_scene.state, "final_parts": memories(self.final_scene)}
         return groups
 
     def _states(self) -> Particles:
@@ -150,9 +150,13 @@ def _first_bad_step(scene, method, dt, first_step, steps):
     return lax.while_loop(going, body, (jnp.zeros((), jnp.int32), scene, bad))[2]
 
 
-def memories(forces: tuple) -> tuple:
-    """Those of the forces that remember."""
-    return tuple(force for force in forces if hasattr(force, "advance"))
+def memories(scene: Scene) -> tuple:
+    """Those of the scene's parts that remember: forces that advance, contacts that know who touches them."""
+    return tuple(part for part in (*scene.forces, *scene.contacts) if _remembers(part))
+
+
+def _remembers(part: Any) -> bool:
+    return hasattr(part, "advance") or bool(getattr(part, "memory", ()))
 
 
 def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
@@ -164,15 +168,15 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
     state = parts = final_scene = None
     if scene is not None and ours:
         final_state = _filled("final_state", scene.state, arrays)
-        final_parts = iter(_filled("final_parts", memories(scene.forces), arrays))
-        forces = tuple(next(final_parts) if hasattr(force, "advance") else force for force in scene.forces)
-        final_scene = eqx.tree_at(lambda s: (s.state, s.forces), scene, (final_state, forces))
+        final_parts = iter(_filled("final_parts", memories(scene), arrays))
+        restore = lambda parts: tuple(next(final_parts) if _remembers(part) else part for part in parts)  # noqa: E731
+        final_scene = scene.having(state=final_state, forces=restore(scene.forces), contacts=restore(scene.contacts))
         if final_state.position.shape != scene.state.position.shape:
             raise ValueError(
                 f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
                 "Give the scene the run was made with."
             )
-        parts = () if recorded else _filled("parts", memories(scene.forces), arrays)
+        parts = () if recorded else _filled("parts", memories(scene), arrays)
     if not recorded:
         state = _filled("state", Particles(0, 0) if scene is None else scene.state, arrays)
     return cls(

@@ -21,6 +21,16 @@ def dot(a: Float[Array, "*lanes dim"], b: Float[Array, "*lanes dim"]) -> Float[A
     return total
 
 
+def components(v: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes"]]:
+    """The components one by one: where much arithmetic alternates between vectors and numbers, XLA is faster with these."""
+    return [v[..., i] for i in range(v.shape[-1])]
+
+
+def stacked(parts: list[Float[Array, "*lanes"]]) -> Float[Array, "*lanes dim"]:
+    """A vector from its components."""
+    return jnp.stack(parts, axis=-1)
+
+
 @jax.custom_jvp
 def norm(v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
     """Length |v|, shaped like the lanes; its derivative at v = 0 is zero instead of NaN."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax.vectors import cross, dot, norm, over, scale, spin, turn_left, unit, upward
+from physjax.vectors import components, cross, dot, norm, over, scale, spin, stacked, turn_left, unit, upward
 
 # large and odd sizes, because jax 0.10.2 returned wrong rows for some of them on CPU (jax issue 39103)
 LANES = pytest.mark.parametrize("n", [1000, 16385, 32769, 50001])
@@ -17,6 +17,8 @@ def everything(a, b, flat, number, vector, amount):
     return {
         "dot": dot(a, b),
         "dot in the plane": dot(flat, turn_left(flat) + flat),
+        "components": components(a)[1],
+        "stacked": stacked(components(a)),
         "norm": norm(a),
         "unit": unit(a),
         "cross": cross(a, b),
@@ -41,6 +43,8 @@ def expected(a, b, flat, number, vector, amount):
     axis[:, 2] = number
     return {
         "dot": (np.sum(a * b, axis=-1), products[:, 0]),
+        "components": (a[:, 1], 0.0),
+        "stacked": (a, 0.0),
         "dot in the plane": (np.sum(flat * flat, axis=-1), 2 * np.sum(flat * flat, axis=-1)),
         "norm": (length, length),
         "unit": (a / length[:, None], 1.0),

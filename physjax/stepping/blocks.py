@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from physjax.lanes import is_per_lane
 from physjax.scene import Function, Scene
 
 BLOCK = 8192
@@ -45,8 +46,8 @@ class Blocks(NamedTuple):
         return blocks if all(map(blocks.is_cut, jax.tree.leaves(moving))) else None
 
     def is_cut(self, leaf: Any) -> bool:
-        """Whether an array has an entry (a number, a vector, a matrix) for each lane."""
-        return hasattr(leaf, "shape") and leaf.shape[: len(self.lanes)] == self.lanes
+        """Whether an array has an entry for each lane."""
+        return is_per_lane(leaf, self.lanes)
 
     def cut(self, tree: Any) -> Any:
         """Per-lane arrays as `(count, size, ...)`, other leaves as they are."""

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.checks import positive_integer, real_quantity
+from physjax.lanes import FEWEST
 from physjax.scene import Function, Scene, as_module
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
@@ -60,13 +61,15 @@ def simulate(
         raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
     method = as_module(method)
     first_step = jnp.asarray(first_step, jnp.int32)
-    rollout = _rollout_alone if record is None and _stands_alone((scene, method, dt, first_step)) else _rollout
+    rollout = _rollout
+    if record is None and _stands_alone((scene, method, dt, first_step)):
+        rollout = _rollout_of_few if _is_mostly_compiled(scene) else _rollout_alone
     return rollout(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
 def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
-    changing = _changing(scene, method, dt)
+    changing = _changing(scene, dt)
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
@@ -97,7 +100,7 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     return Trajectory(
         time=jax.vmap(clock)(first_step + save_every * jnp.arange(frames + 1, dtype=jnp.int32)),
         state=None if film is None else film.state,
-        parts=() if film is None else memories(film.forces),
+        parts=() if film is None else memories(film),
         recorded=None if record is None else kept,
         ok=scene.finite(final_scene.state),
         scene=scene,
@@ -113,11 +116,18 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
 _rollout = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"))
 # XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster; JAX lets us
 # ask only where no other transformation is around the run
-_rollout_alone = jax.jit(
-    _compiled_run,
-    static_argnames=("frames", "save_every", "record"),
-    compiler_options={"xla_cpu_prefer_vector_width": 512},
+_WIDE = {"xla_cpu_prefer_vector_width": 512}
+_rollout_alone = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=_WIDE)
+# timed contacts are many small computations, over which the emitters of jax 0.10 take twice the time of the older ones
+_OLDER = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+_rollout_of_few = jax.jit(
+    _compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=_WIDE | _OLDER
 )
+
+
+def _is_mostly_compiled(scene: Scene) -> bool:
+    """Whether compiling is what a run costs: few lanes, and contacts that remember."""
+    return math.prod(scene.state.lanes) < FEWEST and any(contact.memory for contact in scene.contacts)
 
 
 def _stands_alone(run: tuple) -> bool:
@@ -158,7 +168,7 @@ def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: Array
     One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
-    changing = _changing(scene, method, dt)
+    changing = _changing(scene, dt)
     moving, still = eqx.partition(scene, changing)
 
     def step(i, moving):
@@ -178,17 +188,21 @@ def time_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Array:
     return step.astype(dtype) * dt
 
 
-def _changing(scene: Scene, method: Callable, dt: ArrayLike) -> Any:
-    """Mask over the scene's arrays: the state, and what a step replaced. Found by tracing one step and comparing identities."""
+def _changing(scene: Scene, dt: ArrayLike) -> Any:
+    """Mask over the scene's arrays: the state, what contacts remember, and what `advance` replaces in a force.
+
+    The last is found by tracing it and comparing identities.
+    """
     mask = []
 
     def trace(scene):
-        after = scene.step(method, jnp.zeros((), scene.state.dtype), dt)
+        after = scene.advanced(jnp.zeros((), scene.state.dtype), dt)
         mask.append(jax.tree.map(lambda before, now: before is not now, scene, after))
         return after
 
     jax.eval_shape(trace, scene)
-    return eqx.tree_at(lambda scene: scene.state, mask[0], jax.tree.map(lambda _: True, scene.state))
+    contacts = tuple(contact.changes() for contact in scene.contacts)
+    return mask[0].having(state=jax.tree.map(lambda _: True, scene.state), contacts=contacts)
 
 
 def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:
