@@ -7,6 +7,7 @@ import pytest
 
 from physjax.cli import main
 from physjax.scenes import SCENES
+from physjax.stepping.methods import METHODS
 
 
 def test_chart_writes_picture_csv_and_page(tmp_path, capsys):
@@ -21,6 +22,15 @@ def test_chart_writes_picture_csv_and_page(tmp_path, capsys):
     assert "error 1e-04" in printed
     assert "closed form" in printed
     assert "jax" in printed
+
+
+def test_chart_of_a_scene_with_contacts_shows_both_treatments(tmp_path, monkeypatch):
+    for name in set(METHODS) - {"verlet"}:
+        monkeypatch.delitem(METHODS, name)
+    assert main(["chart", "tennis_ball", "--quick", "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "index.html").read_text()
+    assert "verlet, projected" in page
+    assert "diffrax Tsit5" not in page
 
 
 def test_unknown_scene_names_the_nearest(tmp_path, capsys):

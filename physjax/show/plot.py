@@ -17,21 +17,28 @@ PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8
 """Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""
 MARKERS = "osD^vPX*"
 RIVALS = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
+PROJECTED = ", projected"
+"""What is added to a method's name where its touches are answered at the end of the step."""
 MOST_LANES = 200
 """Paths drawn of a scene with more lanes than this; the eye tells no more apart."""
 
 
 def style(method: str) -> dict[str, Any]:
-    """Line style of a method: colour and marker by its place in the registry; rivals are grey and dashed."""
-    if method in METHODS:
-        place = list(METHODS).index(method)
-        return {
+    """Line style of a method: colour and marker by its place in the registry, dashed and hollow where it is projected.
+
+    Rivals are grey.
+    """
+    name = method.removesuffix(PROJECTED)
+    if name in METHODS:
+        place = list(METHODS).index(name)
+        line = {
             "color": PALETTE[place % len(PALETTE)],
             "marker": MARKERS[place % len(MARKERS)],
             "linestyle": "-",
             "linewidth": 1.5,
             "markersize": 4.5,
         }
+        return line if name == method else line | {"linestyle": "--", "linewidth": 1.1, "markerfacecolor": "white"}
     color, line = RIVALS.get(method, ("0.4", ":"))
     return {"color": color, "marker": ".", "linestyle": line, "linewidth": 1.2, "markersize": 5}
 
@@ -84,8 +91,9 @@ def work_precision(result: Any, figure: Any = None) -> Any:
     from matplotlib import pyplot as plt
 
     figure = figure or plt.figure(figsize=(11, 9))
+    bottom = _below(figure, result)
     panels = figure.subplots(
-        2, 2, gridspec_kw={"left": 0.08, "right": 0.98, "top": 0.92, "bottom": 0.17, "wspace": 0.22, "hspace": 0.3}
+        2, 2, gridspec_kw={"left": 0.08, "right": 0.98, "top": 0.92, "bottom": bottom, "wspace": 0.22, "hspace": 0.3}
     )
     figure.suptitle(f"{result.name.replace('_', ' ')}: {seconds_text(result.duration)}, {result.dtype}", fontsize=14)
     time, position = result.path
@@ -113,10 +121,33 @@ def work_precision(result: Any, figure: Any = None) -> Any:
         _curves(ax, result, "evaluations", "path_error")
         ax.set(xlabel="force evaluations", ylabel="largest error on the path [path extent]")
         ax.set_title("the same on any machine: error against evaluations", fontsize=11)
-    handles = {method: plt.Line2D([], [], **style(method), label=_legend(result, method)) for method in result.methods}
-    handles["failed"] = plt.Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
-    figure.legend(handles=list(handles.values()), loc="lower center", ncols=3, fontsize=9.5, frameon=False)
     return figure
+
+
+def _below(figure: Any, result: Any) -> float:
+    """The legend, which stands below the panels; returns the share of the figure's height that they must leave to it."""
+    from matplotlib import pyplot as plt
+
+    # where both treatments of contacts ran, each has a column of its own, a method to a line
+    methods = sorted(result.methods, key=lambda method: method.endswith(PROJECTED))
+    projected = methods[-1].endswith(PROJECTED)
+    handles = [plt.Line2D([], [], **style(method), label=_legend(result, method)) for method in methods]
+    failed = plt.Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
+    handles.insert(len(methods) // 2 if projected else len(methods), failed)
+    columns = 2 if projected else 3
+    what = (
+        "solid: impacts found inside the step; dashed, hollow: projected at the end of the step" if projected else None
+    )
+    figure.legend(
+        handles=handles,
+        loc="lower center",
+        ncols=columns,
+        fontsize=9.5,
+        frameon=False,
+        title=what,
+        title_fontsize=9.5,
+    )
+    return max(0.17, 0.07 + 0.023 * (projected + math.ceil(len(handles) / columns)))
 
 
 def _curves(ax: Any, result: Any, x: str, y: str) -> None:

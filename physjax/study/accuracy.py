@@ -6,6 +6,7 @@ far the reference moves, and a run that fails is kept and marked, never dropped.
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,8 +16,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.checks import real_quantity
+from physjax.physics import contacts
 from physjax.scene import Particles, Scene, as_module
-from physjax.stepping.methods import METHODS
+from physjax.show.plot import PROJECTED
+from physjax.show.report import seconds_text
+from physjax.stepping.methods import METHODS, rk4
 from physjax.stepping.reference import default_solver, in_dtype, reference, solve_ode
 from physjax.stepping.simulate import sample
 from physjax.study.energy import Conserved
@@ -29,6 +33,9 @@ TOLERANCES = tuple(10.0**-k for k in range(2, 13))
 
 DETAIL = 12
 """Moments of the reference path for every one at which errors are measured."""
+
+FINE, COARSER = 16, 11
+"""Steps between two of those moments where rk4 must be the reference because there are contacts, and to estimate its error."""
 
 
 class Budget(NamedTuple):
@@ -66,8 +73,11 @@ def work_precision(
     `methods`: all of the registry by default. `dts` [s]: from coarse to fine within the budget by default; each is
     rounded so that a whole number of steps fits between the moments compared. `rivals`: diffrax solvers, run adaptively
     at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts. The truth is the closed form
-    where there is one, else diffrax's Dopri8 at 1e-13, whose own error is the floor of the result. Compiles once per
-    method. `progress(what)` is called before each method. Raises ValueError for a missing duration or bad steps.
+    where there is one, else diffrax's Dopri8 at 1e-13, or our own rk4 with fine steps where there are contacts; its own
+    error is the floor of the result. Where impacts are timed (`contacts.impact`), every method runs once more with
+    `contacts.project`, the lecture's answer at the end of the step, as "rk4, projected": what that does to the order.
+    Compiles once per method and treatment. `progress(what)` is called before each method. Raises ValueError for a
+    missing duration or bad steps.
     """
     problem = _as_problem(problem, duration, exact, conserved)
     methods = list(METHODS.values()) if methods is None else list(methods)
@@ -84,9 +94,11 @@ def work_precision(
         truth = jax.tree.map(lambda leaf: leaf[::DETAIL], path)
         measure = _Errors(problem, scene, truth)
         runs = []
+        treatments = _treatments(scene)
         for method in methods:
             progress(_name(method))
-            runs += _method_runs(problem, scene, method, dts, measure, budget)
+            for treatment, treated in treatments.items():
+                runs += _method_runs(problem, treated, method, _name(method) + treatment, dts, measure, budget)
         for solver in rivals:
             progress(f"diffrax {type(solver).__name__}")
             runs += _rival_runs(problem, scene, solver, tolerances, measure, budget)
@@ -94,7 +106,11 @@ def work_precision(
     return WorkPrecision(
         name=name,
         runs=tuple(runs),
-        promised={_name(m): _promised_order(m, velocity_dependent) for m in methods},
+        promised={
+            _name(method) + treatment: _promised_order(method, velocity_dependent, treated)
+            for method in methods
+            for treatment, treated in treatments.items()
+        },
         truth=source,
         floor=floor,
         duration=problem.duration,
@@ -102,6 +118,19 @@ def work_precision(
         dtype=np.dtype(dtype).name,
         path=(_detailed(problem), path.position),
     )
+
+
+def _treatments(scene: Scene) -> dict[str, Scene]:
+    """The scene, and where it times impacts also the scene that projects instead, by what is added to a method's name."""
+    if not any(contact.response is contacts.impact for contact in scene.contacts):
+        return {"": scene}
+    project = [
+        replace(contact, response=contacts.project, touching_since=None)
+        if contact.response is contacts.impact
+        else contact
+        for contact in scene.contacts
+    ]
+    return {"": scene, PROJECTED: Scene(scene.state, scene.mass, scene.forces, project, scene.pinned)}
 
 
 class _Errors:
@@ -141,6 +170,8 @@ def _truth(problem: Problem) -> tuple[Particles, float, str]:
     times = _detailed(problem)
     if problem.exact is not None:
         return problem.exact(times), 0.0, "closed form"
+    if problem.scene.contacts:
+        return _fine_path(problem)
     size = _smallest_size(problem.scene)
     tolerance = {"rtol": 1e-13, "atol": 1e-13 * size}
     path = reference(problem.scene, times, **tolerance)
@@ -151,13 +182,23 @@ def _truth(problem: Problem) -> tuple[Particles, float, str]:
     return path.state, float(floor), "diffrax Dopri8, tolerance 1e-13"
 
 
+def _fine_path(problem: Problem) -> tuple[Particles, float, str]:
+    """The path by rk4 with fine steps; its error is estimated by longer ones, which end at other moments."""
+    scene, frames = in_dtype(problem.scene, jnp.float64), problem.frames * DETAIL
+    run = lambda count: sample(scene, as_module(rk4), problem.duration / (frames * count), count, frames=frames)  # noqa: E731
+    path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(count))) for count in (FINE, COARSER))
+    extent = np.abs(path.position - path.position[0]).max()
+    floor = np.abs(path.position - coarser.position).max() / extent
+    return path, float(floor), f"own rk4, step {seconds_text(problem.duration / (frames * FINE))}"
+
+
 def _detailed(problem: Problem) -> np.ndarray:
     """The problem's times and more between them, so that a picture of the path has no corners."""
     return np.linspace(0.0, problem.duration, problem.frames * DETAIL + 1)
 
 
-def _method_runs(problem, scene, method, dts, measure, budget):
-    """One method from coarse to fine: one compilation, then runs until the budget or rounding ends the refinement."""
+def _method_runs(problem, scene, method, name, dts, measure, budget):
+    """One method, from coarse to fine: one compilation, then runs until the budget or rounding ends the refinement."""
     dt = jnp.asarray(problem.duration / problem.frames, scene.state.dtype)
     module = as_module(method)
     started = time.perf_counter()
@@ -171,18 +212,7 @@ def _method_runs(problem, scene, method, dts, measure, budget):
         steps = count * problem.frames
         final, path, drifts = measure(states)
         runs.append(
-            Run(
-                _name(method),
-                float(h),
-                None,
-                steps,
-                evaluations * steps,
-                *seconds,
-                compile_seconds,
-                final,
-                path,
-                drifts,
-            )
+            Run(name, float(h), None, steps, evaluations * steps, *seconds, compile_seconds, final, path, drifts)
         )
         if dts is None and (seconds[0] > budget.seconds or _at_rounding(runs)):
             break
@@ -278,11 +308,13 @@ def _depends_on_velocity(scene: Scene) -> bool:
         )
 
 
-def _promised_order(method, velocity_dependent):
+def _promised_order(method, velocity_dependent, scene):
+    """The order that a method promises for a scene; no more than 1 where touches are answered at the end of the step."""
     promises = getattr(method, "promises", None)
     if promises is None:
         return float("nan")
-    return float(promises.order_with_drag if velocity_dependent else promises.order)
+    order = float(promises.order_with_drag if velocity_dependent else promises.order)
+    return min(order, 1.0) if any(contact.response is contacts.project for contact in scene.contacts) else order
 
 
 class _Counter(NamedTuple):

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from physjax import methods, reference, simulate
+from physjax import methods, simulate
 from physjax.scenes import SCENES, title
 from physjax.scenes.gallery import table
 
@@ -24,7 +24,7 @@ def test_every_truth_holds(problem):
 def test_the_closed_form_solves_the_equations_of_motion(problem):
     if problem.exact is None:
         pytest.skip("no closed form")
-    flight = reference(problem.scene, problem.times, rtol=1e-12, atol=1e-12)
+    flight = problem.reference()
     exact = problem.exact(problem.times)
     size = np.abs(exact.position).max()
     np.testing.assert_allclose(flight.position, exact.position, atol=1e-9 * size, rtol=0)

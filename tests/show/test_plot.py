@@ -62,6 +62,30 @@ def test_methods_keep_apart_in_colour_and_marker():
     assert len({style["marker"] for style in styles}) == len(METHODS)
 
 
+def test_both_treatments_of_a_bounce_are_told_apart_and_belong_together():
+    for name in METHODS:
+        timed, projected = plot.style(name), plot.style(name + plot.PROJECTED)
+        assert (projected["color"], projected["marker"]) == (timed["color"], timed["marker"])
+        assert (timed["linestyle"], projected["linestyle"]) == ("-", "--")
+        assert projected["markerfacecolor"] == "white"
+
+
+def test_the_legend_has_room_below_the_panels():
+    study = work_precision(
+        SCENES["tennis_ball"](), [methods.verlet], [0.01], budget=Budget(0.02, 1, 2.0), name="tennis"
+    )
+    runs = tuple(
+        run._replace(method=name + end) for run in study.runs for name in METHODS for end in ("", plot.PROJECTED)
+    )
+    figure = study._replace(runs=runs, promised={run.method: 1.0 for run in runs}).plot()
+    figure.canvas.draw()
+    legend = figure.legends[0].get_window_extent()
+    assert legend.x0 >= 0
+    assert legend.x1 <= figure.bbox.width
+    assert legend.y1 <= min(ax.xaxis.get_tightbbox().y0 for ax in figure.axes)
+    assert "projected at the end of the step" in figure.legends[0].get_title().get_text()
+
+
 def test_table_is_aligned():
     text = report.table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
     lines = text.splitlines()

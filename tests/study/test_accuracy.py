@@ -156,10 +156,40 @@ def test_diffrax_is_no_rival_where_it_would_fall_through_the_floor():
         return Particles(1 - 4.9 * since**2, -9.8 * since)
 
     study = work_precision(ball, [methods.verlet], [1e-3, 1e-4], duration=1.0, exact=exact, budget=FEW)
-    assert study.methods == ("verlet",)
-    assert study.runs[-1].path_error < 2e-3
+    assert study.methods == ("verlet", "verlet, projected")
+    assert study.of("verlet")[-1].path_error < 1e-12
+    assert 1e-6 < study.of("verlet, projected")[-1].path_error < 2e-3
     with pytest.raises(ValueError, match="has contacts"):
         work_precision(ball, [methods.verlet], [1e-3], duration=1.0, exact=exact, rivals=accuracy.default_rivals())
+
+
+def test_where_a_bounce_is_answered_decides_the_order():
+    """Forty-eight drop heights with drag: timed, a method keeps its order; at the end of the step, all are first order."""
+    dts = 2.0 / 32 / 2.0 ** np.arange(11)
+    study = work_precision(SCENES["bouncing_ball"](), [methods.verlet, methods.rk4], dts, budget=FEW)
+    assert study.truth == "closed form"
+    assert study.promised == {"verlet": 2, "verlet, projected": 1, "rk4": 4, "rk4, projected": 1}
+    assert study.observed_order("verlet") == pytest.approx(2, abs=0.15)
+    assert study.observed_order("rk4") == pytest.approx(4, abs=0.15)
+    assert study.observed_order("verlet, projected") == pytest.approx(1, abs=0.2)
+    assert study.observed_order("rk4, projected") == pytest.approx(1, abs=0.2)
+    assert "rk4, projected" in study.table()
+
+
+def test_contacts_without_a_closed_form_are_measured_against_our_own_fine_steps():
+    study = work_precision(SCENES["free_kick"](), [methods.rk4], [1e-3, 1e-2], budget=FEW)
+    assert "own rk4" in study.truth
+    assert 0 < study.floor < 1e-12
+    timed, projected = study.of("rk4"), study.of("rk4, projected")
+    assert timed[0].path_error < 1e-9 < 1e-5 < projected[0].path_error
+
+
+def test_what_is_projected_already_has_one_treatment():
+    floor = contacts.Plane((0.0,), (1.0,), response=contacts.project)
+    ball = Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(forces.Gravity(up=0),), contacts=(floor,))
+    study = work_precision(ball, [methods.verlet], [1e-3], duration=1.0, budget=FEW)
+    assert study.promised == {"verlet": 1}
+    assert study.floor > 1e-6, "the reference is first order too, and says so"
 
 
 def test_rivals_can_be_chosen():
