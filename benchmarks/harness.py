@@ -309,10 +309,16 @@ def print_bars(bars: Sequence[Bar], quick: bool) -> None:
     print_table("Bars" + (", not judged in a quick run" if quick else ""), ["", "measured", "wanted", ""], lines)
 
 
-def bar_chart(path: Path, panels: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], foot: str) -> None:
+def bar_chart(
+    path: Path,
+    panels: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]],
+    foot: str,
+    labels: Mapping[str, str] | None = None,
+) -> None:
     """Horizontal bars on a logarithmic axis: a panel is (title, axis label, rows as made by `row`).
 
-    Bars are the best of the turns, ticks their median. The file is whole or absent.
+    Bars are the best of the turns, ticks their median. `labels` say what the families mean where it is not
+    their own name. The file is whole or absent.
     """
     from matplotlib.figure import Figure  # no pyplot: no display and no global state
     from matplotlib.patches import Patch
@@ -337,7 +343,7 @@ def bar_chart(path: Path, panels: Sequence[tuple[str, str, Sequence[Mapping[str,
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(axis="x", which="major", alpha=0.3)
         axis.set_axisbelow(True)
-    keys = [Patch(color=colour, label=family) for family, colour in COLOURS.items()]
+    keys = [Patch(color=colour, label=(labels or {}).get(family, family)) for family, colour in COLOURS.items()]
     figure.legend(handles=keys, loc="outside upper right", ncols=len(keys), frameon=False)
     figure.supxlabel(f"{foot}\nbar: best of the turns, tick: their median", fontsize=8, x=0.01, ha="left")
     with replacing(path, "wb") as file:
