@@ -12,7 +12,7 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from physjax import scenes
-    from physjax.physics import contacts
+    from physjax.physics import contacts, lattices, springs
     from physjax.show import plot
     from physjax.study import accuracy, energy, projectile
 
@@ -27,6 +27,7 @@ __all__ = [
     "contacts",
     "energy",
     "forces",
+    "lattices",
     "loads",
     "methods",
     "ode_term",
@@ -35,6 +36,7 @@ __all__ = [
     "reference",
     "scenes",
     "simulate",
+    "springs",
 ]
 __version__ = "0.1.0"
 
@@ -43,9 +45,11 @@ _LATER = {
     "accuracy": "physjax.study.accuracy",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
+    "lattices": "physjax.physics.lattices",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
     "scenes": "physjax.scenes",
+    "springs": "physjax.physics.springs",
 }
 
 

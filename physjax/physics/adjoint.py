@@ -1,0 +1,60 @@
+"""Linear maps that bring their own transpose, so that reverse mode is as well laid out as the map.
+
+JAX transposes a slice into a padded array and a gather into a scatter, and then adds them all up; a map between nodes
+and springs has a transpose of slices and gathers, which it states here. Works under jit, vmap, and any derivative.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+_linear = Primitive("linear_with_transpose")
+_linear.multiple_results = True
+
+
+def linear(forward: Callable, backward: Callable, arrays: tuple[Array, ...]) -> list[Array]:
+    """`forward(*arrays)`, a list of arrays that depends linearly on them; `backward` is its transpose.
+
+    Both take any leading axes and treat them alike. Neither may close over arrays that are traced.
+    """
+    return _linear.bind(*arrays, forward=forward, backward=backward)
+
+
+@_linear.def_impl
+def _run(*arrays, forward, backward):
+    return forward(*arrays)
+
+
+@_linear.def_abstract_eval
+def _shapes(*arrays, forward, backward):
+    shapes = jax.eval_shape(forward, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
+    return [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
+
+
+def _derivative(primals, tangents, **maps):
+    tangents = [ad.instantiate_zeros(t) for t in tangents]
+    return _linear.bind(*primals, **maps), _linear.bind(*tangents, **maps)
+
+
+def _transpose(cotangents, *arrays, forward, backward):
+    return _linear.bind(*(ad.instantiate_zeros(c) for c in cotangents), forward=backward, backward=forward)
+
+
+def _batched(arrays, axes, **maps):
+    size = next(a.shape[i] for a, i in zip(arrays, axes, strict=True) if i is not None)
+    front = [
+        jnp.broadcast_to(a, (size, *a.shape)) if i is None else jnp.moveaxis(a, i, 0)
+        for a, i in zip(arrays, axes, strict=True)
+    ]
+    found = _linear.bind(*front, **maps)
+    return found, [0] * len(found)
+
+
+mlir.register_lowering(_linear, mlir.lower_fun(_run, multiple_results=True))
+ad.primitive_jvps[_linear] = _derivative
+ad.primitive_transposes[_linear] = _transpose
+batching.primitive_batchers[_linear] = _batched
