@@ -44,6 +44,8 @@ class Surface(Contact):
                 demand(name, value, concrete(value) <= 1, "numbers from 0 to 1")
         if self.friction is not None and self.coulomb is not None:
             raise ValueError("contact: got friction= (the lecture's K_f) and coulomb=, expected at most one of them.")
+        if self.response is not None and not callable(self.response):
+            raise TypeError(f"response: got {self.response!r}, expected contacts.impact, contacts.project or None.")
 
     @property
     def memory(self) -> tuple[str, ...]:

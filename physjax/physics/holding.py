@@ -4,6 +4,7 @@ Once a step, at its start, `hold` decides for each lane: the surface lets go whe
 holds it still where it stands and μ_s suffices; else it slides. Then the `Reaction` joins the forces for the step.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -44,14 +45,19 @@ class Reaction(eqx.Module):
         return lax.cond(self.anywhere, lambda: self._added(t, state, acceleration), lambda: acceleration)
 
     def _added(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:
-        total = components(acceleration)
         contacts = [self._at(i, t, state) for i in range(len(self.surfaces))]
-        normal_force = [jnp.zeros_like(pressed) for pressed in self.pressed]
-        for _ in range(self.sweeps):
+
+        def sweep(_, forces):
+            total, normal_force = forces
+            normal_force = list(normal_force)
             for i, (normal, bend, along) in enumerate(contacts):
                 now = self.pressed[i] * jnp.maximum(normal_force[i] - _dot(total, normal) - bend, 0.0)
                 total = _plus(total, now - normal_force[i], along)
                 normal_force[i] = now
+            return total, normal_force
+
+        forces = (components(acceleration), [jnp.zeros_like(pressed) for pressed in self.pressed])
+        total, _ = sweep(0, forces) if self.sweeps == 1 else lax.fori_loop(0, self.sweeps, sweep, forces)
         free = 1 - self.still
         return stacked([free * part for part in total])
 
@@ -90,7 +96,7 @@ def hold(scene: Scene, surfaces: tuple, since: tuple, t: ArrayLike, dt: ArrayLik
     ]
     masks = [touch.astype(scene.state.dtype) for touch in touching]
     flag = jnp.isfinite(jnp.stack(since))
-    at = lax.stop_gradient(apart(flag, lambda: _put_back(surfaces, masks, t, scene.state), scene.state))
+    at = lax.stop_gradient(_put_back(surfaces, masks, t, scene.state, flag))
     unheld = lax.stop_gradient(apart(flag, lambda: scene.acceleration(t, at), at.velocity))
 
     def look():
@@ -102,7 +108,7 @@ def hold(scene: Scene, surfaces: tuple, since: tuple, t: ArrayLike, dt: ArrayLik
     since = tuple(jnp.where(p > 0, s, jnp.inf) for p, s in zip(pressed, since, strict=True))
     # what stands still on a surface that does too keeps its place to the last bit: nothing creeps
     moves = [p * (1 - still) if s.velocity is None else p for p, s in zip(pressed, surfaces, strict=True)]
-    x, v = _put_back(surfaces, moves, t, scene.state)
+    x, v = _put_back(surfaces, moves, t, scene.state, flag)
     for surface, p in zip(surfaces, pressed, strict=True):
         v = v - scale(still * p, surface.relative(v))
     return Held(Particles(x, v), since, pressed, slip, still)
@@ -209,16 +215,20 @@ def _is_close(surface: eqx.Module, state: Particles, t: ArrayLike, dt: ArrayLike
     return jnp.abs(surface.gap(t, x)) <= reach + rounding
 
 
-def _put_back(surfaces: tuple, touching: list, t: ArrayLike, state: Particles) -> Particles:
+def _put_back(surfaces: tuple, touching: list, t: ArrayLike, state: Particles, flag: Array) -> Particles:
     """Onto the surfaces and along them: what the truncation of the last step left over is taken away."""
-    x, v = state
     for surface, touch in zip(surfaces, touching, strict=True):
-        normal = surface.outward(t, x)
-        x = x - scale(touch * surface.gap(t, x), normal)
-        relative = surface.relative(v)
-        v = v - scale(touch * dot(relative, normal), normal)
-        if surface.friction is not None:
-            v = v - scale(jnp.where(surface.friction > 0, touch, 0.0), surface.relative(v))
+        state = apart(flag, partial(_put_back_on, surface, touch, t, state), state)
+    return state
+
+
+def _put_back_on(surface: eqx.Module, touch: Array, t: ArrayLike, state: Particles) -> Particles:
+    x, v = state
+    normal = surface.outward(t, x)
+    x = x - scale(touch * surface.gap(t, x), normal)
+    v = v - scale(touch * dot(surface.relative(v), normal), normal)
+    if surface.friction is not None:
+        v = v - scale(jnp.where(surface.friction > 0, touch, 0.0), surface.relative(v))
     return Particles(x, v)
 
 

@@ -20,7 +20,7 @@ from physjax.lanes import any_lane, apart, on_flagged
 from physjax.physics.holding import Held, carried, hold, nothing_held
 from physjax.physics.rebound import rebound
 from physjax.scene import Function, Particles, Scene
-from physjax.vectors import dot, scale
+from physjax.vectors import dot
 
 IMPACTS = 8
 """Touches that one lane may have within one step; after so many it stays where it is, with its velocity, until the next."""
@@ -139,6 +139,7 @@ def _answer(
     reached = 64 * eps * jnp.sqrt(dot(at.position, at.position)) + eps**0.5 * (meeting.above - meeting.below)
     touches = meeting.hit & (jnp.min(guards, axis=0) <= lax.stop_gradient(reached))
     state, since = at, list(start.since)
+    # one guard a lane: each answer starts from the same state, and is taken where it applies
     for i, wall in enumerate(_faces(walls, t, start.state)):
         here = touches & (which == i)
         normal, relative = wall.outward(t, at.position), wall.relative(at.velocity)
@@ -146,19 +147,20 @@ def _answer(
         lift = wall.restitution * -inward
         weight = -(dot(acceleration, normal) + wall.bend(t, at.position, relative))
         rests = here & (2 * lift <= SHORTEST_FLIGHT * dt * weight) & ((wall.restitution < 1) | (lift == 0))
-        depth = jnp.where(here, wall.gap(t, at.position), 0.0)
-        state = rebound(wall, state, (depth, normal, relative), inward, rests)
+        touch = (wall.gap(t, at.position), normal, relative)
+        state = _where(here, rebound(wall, at, touch, inward, rests), state)
         flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - wall.restitution), 1.0)
         since[i] = jnp.where(rests, t + flights, since[i])
-        for j, other in enumerate(walls):
-            if j != i:
-                since[j] = jnp.where(here & _leaves(other, t, state), jnp.inf, since[j])
     slides = [i for i, slip in enumerate(start.slip) if slip is not None]
     for guard, i in enumerate(slides, start=len(walls)):
-        relative, before = walls[i].relative(state.velocity), walls[i].relative(start.state.velocity)
+        relative, before = walls[i].relative(at.velocity), walls[i].relative(start.state.velocity)
         slowed = dot(relative, relative) < 0.25 * dot(before, before)  # else it only turned
-        stops = (touches & (which == guard) & slowed).astype(at.dtype)
-        state = Particles(state.position, state.velocity - scale(stops, relative))
+        stopped = Particles(at.position, at.velocity - relative)
+        state = _where(touches & (which == guard) & slowed, stopped, state)
+    bounced = touches & (which < len(walls))
+    for i, wall in enumerate(walls):
+        # a bounce elsewhere throws a lane off what it touched, or into it: then that is a new touch
+        since[i] = jnp.where(bounced & (which != i) & _leaves(wall, t, state), jnp.inf, since[i])
     return state, tuple(since)
 
 
