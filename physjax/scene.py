@@ -252,8 +252,9 @@ class Scene(eqx.Module):
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
         motion = partial(_free_motion, method)
+        responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
-        for response in sorted({contact.response or project for contact in self.contacts}, key=lambda r: r is project):
+        for response in sorted(responses, key=lambda response: response is project):
             motion = partial(response, motion)
         after = motion(self, t, dt)
         state = after.state

@@ -60,7 +60,7 @@ def _held_step(
     """A step in which surfaces hold some lanes."""
     walls = _walls(scene)
     start = apart(anywhere, lambda: hold(scene, walls, since, t, dt), nothing_held(scene, walls, since))
-    return motion(carried(scene, _walls(scene), start), t, dt).state, start.since
+    return motion(carried(scene, walls, start), t, dt).state, start.since
 
 
 def _may_meet(scene: Scene, since: tuple, end: Particles, t: ArrayLike, dt: ArrayLike) -> Array:
