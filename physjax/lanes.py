@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 
 FEWEST = 1024
 """Scenes with fewer lanes are not worth picking lanes from."""
-SHARE = 32
+SHARE = 64
 """One lane in so many is room enough for the lanes that are picked at once."""
 
 
@@ -57,24 +57,68 @@ def on_flagged(function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *
     size = math.ceil(total / SHARE)
     by_lane = lambda leaf: leaf.reshape((total, *leaf.shape[len(lanes) :]))  # noqa: E731
     flat = jax.tree.map(by_lane, changing)
-    rank = jnp.cumsum(flag.ravel(), dtype=jnp.int32)
-    count = rank[-1]
+    words, upto = _census(flag.ravel())
 
     def group(now, first):
-        # the k-th flagged lane is where the count reaches k; beyond the last there is none, and nothing is written
-        index = jnp.searchsorted(rank, first + 1 + jnp.arange(size, dtype=jnp.int32)).astype(jnp.int32)
+        index = _picked(words, upto, first + jnp.arange(size, dtype=jnp.int32))
         pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
         few = [jax.tree.map(lambda a: pick(by_lane(a)) if is_per_lane(a, lanes) else a, other) for other in others]
         done = function(jax.tree.map(pick, now), *few)
+        # beyond the last flagged lane there is none, and nothing is written
         return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop"), now, done)
 
-    def groups():
-        firsts = jnp.arange(0, total, size, dtype=jnp.int32)
+    def groups(now, first):
         some = lambda now, first: (  # noqa: E731
-            lax.cond(any_lane(first < count), lambda: group(now, first), lambda: now),
+            lax.cond(any_lane(first < upto[-1]), lambda: group(now, first), lambda: now),
             None,
         )
-        end, _ = lax.scan(some, flat, firsts)
-        return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
+        return lax.scan(some, now, first)[0]
 
-    return lax.cond(any_lane(flag), groups, lambda: changing)
+    firsts = jnp.arange(0, total, size, dtype=jnp.int32)
+    end = groups(flat, firsts[:1])
+    end = lax.cond(any_lane(upto[-1] > size), lambda: groups(end, firsts[1:]), lambda: end)
+    return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
+
+
+def _census(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
+    """The flags as words of 32 bits, and how many are set up to and in each word: bit b of word w is lane b·words + w."""
+    length = math.ceil(flag.size / 32)
+    bits = jnp.zeros(32 * length, bool).at[: flag.size].set(flag).reshape(32, length).astype(jnp.uint32)
+    words = bits[0]
+    for place in range(1, 32):
+        words = words | (bits[place] << place)
+    return words, jnp.cumsum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
+
+
+def _picked(words: Array, upto: Array, number: Array) -> Array:
+    """The lanes of the flags with these numbers, counted from zero; the number of lanes or more where there are not so many."""
+    word = jnp.searchsorted(upto, number + 1, method="scan_unrolled").astype(jnp.int32)
+    left = words.at[word].get(mode="clip")
+    rank = number - upto.at[word].get(mode="clip") + lax.population_count(left).astype(jnp.int32)
+    place = jnp.zeros_like(number)
+    for width in (16, 8, 4, 2, 1):
+        below = lax.population_count(left & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
+        above = rank >= below
+        rank = rank - jnp.where(above, below, 0)
+        place = place + jnp.where(above, width, 0)
+        left = jnp.where(above, left >> width, left)
+    return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
+
+
+def loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
+    """`lax.while_loop(going, body, start)`, at most so many times; quick to compile where the lanes are few.
+
+    XLA on CPU makes one function of a small loop and of everything in it, which runs faster but takes five times as long
+    to compile, or more; a scatter, be it of one number, is what it will not have there.
+    """
+    few = max(leaf.size for leaf in jax.tree.leaves(start)) < FEWEST
+    one = jnp.asarray([1, 0], jnp.int32)
+
+    def again(state):
+        return going(state[0]) & (state[1][0] < most)
+
+    def once(state):
+        carry, count = state
+        return body(carry), count.at[jnp.minimum(count, 0)].add(one) if few else count + one
+
+    return lax.while_loop(again, once, (start, jnp.zeros_like(one)))[0]

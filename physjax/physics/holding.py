@@ -8,21 +8,22 @@ from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.lanes import any_lane, apart
+from physjax.lanes import any_lane, apart, loop
 from physjax.scene import Particles, Scene
 from physjax.vectors import components, dot, norm, scale, stacked, unit
 
-SWEEPS = 4
-"""Passes over several surfaces that share one lane's weight; one surface, or walls at right angles, need one."""
-SETTLING = 60
-"""Passes to decide whether several surfaces together hold a lane still: each shrinks what is left by cos² of their angle."""
+SETTLING = 400
+"""Most passes to decide whether several surfaces hold a lane still: each shrinks what is left by cos² of their angle."""
 ENOUGH = 1e18
 """A coefficient of static friction that always suffices."""
+PARALLEL = 1e-5
+"""Two surfaces whose normals differ by less (sin² of the angle) are one: the second carries nothing."""
 
 
 class Reaction(eqx.Module):
@@ -30,34 +31,32 @@ class Reaction(eqx.Module):
 
     `pressed` and `slip` are per surface: which lanes it carries, and the direction in which they slip at the start of
     the step. A lane that would turn around within the step is braked on beyond zero, so that the path stays smooth and
-    the moment of the stop can be found.
+    the moment of the stop can be found. No lane leans on more surfaces than space has dimensions: where there are more,
+    `places` says which of them takes each lane's first place, its second and so on.
     """
 
     surfaces: tuple
     pressed: tuple[Float[Array, "*lanes"], ...]
     slip: tuple[Float[Array, "*lanes dim"] | None, ...]
     still: Float[Array, "*lanes"]
+    places: tuple[tuple[Float[Array, "*lanes"], ...], ...] | None
     anywhere: Bool[Array, ""]
-    sweeps: int = eqx.field(static=True)
 
     def __call__(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:
         """The acceleration [m/s²] with the reactions added."""
         return lax.cond(self.anywhere, lambda: self._added(t, state, acceleration), lambda: acceleration)
 
     def _added(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:
-        contacts = [self._at(i, t, state) for i in range(len(self.surfaces))]
-
-        def sweep(_, forces):
-            total, normal_force = forces
-            normal_force = list(normal_force)
-            for i, (normal, bend, along) in enumerate(contacts):
-                now = self.pressed[i] * jnp.maximum(normal_force[i] - _dot(total, normal) - bend, 0.0)
-                total = _plus(total, now - normal_force[i], along)
-                normal_force[i] = now
-            return total, normal_force
-
-        forces = (components(acceleration), [jnp.zeros_like(pressed) for pressed in self.pressed])
-        total, _ = sweep(0, forces) if self.sweeps == 1 else lax.fori_loop(0, self.sweeps, sweep, forces)
+        felt = [self._at(i, t, state) for i in range(len(self.surfaces))]
+        total = components(acceleration)
+        if self.places is None:
+            presses = list(self.pressed)
+        else:
+            presses, felt = [sum(place) for place in self.places], [_picked(place, felt) for place in self.places]
+        wanted = [-_dot(total, normal) - bend for normal, bend, _ in felt]
+        weights = [[_dot(normal, along) for _, _, along in felt] for normal, _, _ in felt]
+        for force, (_, _, along) in zip(_normal_forces(weights, wanted, presses), felt, strict=True):
+            total = _plus(total, force, along)
         free = 1 - self.still
         return stacked([free * part for part in total])
 
@@ -90,17 +89,18 @@ class Held(NamedTuple):
 
 def hold(scene: Scene, surfaces: tuple, since: tuple, t: ArrayLike, dt: ArrayLike) -> Held:
     """What carries each lane through the coming step; `since` [s] is when it began to touch each surface (infinite: never)."""
+    flag = jnp.isfinite(jnp.stack(since))
+    unheld = lax.stop_gradient(apart(flag, lambda: scene.acceleration(t, scene.state), scene.state.velocity))
+    kick = dot(unheld, unheld) * (dt * dt)
     touching = [
-        jnp.isfinite(moment) & _is_close(surface, scene.state, t, dt)
+        jnp.isfinite(moment) & _is_close(surface, scene.state, kick, t, dt)
         for surface, moment in zip(surfaces, since, strict=True)
     ]
     masks = [touch.astype(scene.state.dtype) for touch in touching]
-    flag = jnp.isfinite(jnp.stack(since))
     at = lax.stop_gradient(_put_back(surfaces, masks, t, scene.state, flag))
-    unheld = lax.stop_gradient(apart(flag, lambda: scene.acceleration(t, at), at.velocity))
 
     def look():
-        speed = dot(scene.state.velocity, scene.state.velocity) + dot(unheld, unheld) * (dt * dt)
+        speed = dot(scene.state.velocity, scene.state.velocity) + kick
         return [_contact(s, t, at, mask, speed) for s, mask in zip(surfaces, masks, strict=True)]
 
     contacts, unheld = lax.stop_gradient(apart(flag, look)), components(unheld)
@@ -144,11 +144,57 @@ def nothing_held(scene: Scene, surfaces: tuple, since: tuple) -> Held:
 
 def carried(scene: Scene, surfaces: tuple, held: Held) -> Scene:
     """The scene with the lanes held as decided, ready for a step."""
-    # the walls of one room stand at right angles, so one pass is exact
-    sweeps = 1 if len(scene.contacts) == 1 else SWEEPS
     anywhere = any_lane(jnp.any(jnp.stack(held.pressed) > 0, axis=0))
-    reaction = Reaction(surfaces, held.pressed, held.slip, held.still, anywhere, sweeps)
+    reaction = Reaction(surfaces, held.pressed, held.slip, held.still, _places(held), anywhere)
     return scene.having(state=held.state, reaction=reaction)
+
+
+def _places(held: Held) -> tuple | None:
+    """For each place, which surface takes it, lane by lane; None where every surface has one of its own."""
+    dim = held.state.position.shape[-1]
+    if len(held.pressed) <= dim:
+        return None
+    before, ranks = jnp.zeros_like(held.still), []
+    for pressed in held.pressed:
+        ranks.append(before)
+        before = before + pressed
+    return tuple(
+        tuple(jnp.where(rank == place, pressed, 0.0) for pressed, rank in zip(held.pressed, ranks, strict=True))
+        for place in range(dim)
+    )
+
+
+def _picked(place: tuple, felt: list[tuple]) -> tuple:
+    """How the surface in one place feels: of normal, bend and reaction those of the lane's own surface."""
+    pick = lambda *values: sum(share * value for share, value in zip(place, values, strict=True))  # noqa: E731
+    return jax.tree.map(pick, *felt)
+
+
+def _normal_forces(weights: list[list[Array]], wanted: list[Array], presses: list[Array]) -> list[Array]:
+    """The N >= 0 with Σ_j W_ij N_j = w_i of the surfaces that press; one that would have to pull lets go."""
+    forces = _solved(weights, wanted, presses)
+    if len(forces) > 1:
+        forces = _solved(
+            weights, wanted, [jnp.where(force > 0, p, 0.0) for p, force in zip(presses, forces, strict=True)]
+        )
+    return [jnp.maximum(force, 0.0) for force in forces]
+
+
+def _solved(weights: list[list[Array]], wanted: list[Array], presses: list[Array]) -> list[Array]:
+    """Gaussian elimination, lane by lane, over those that press."""
+    rows, right, inverse = [list(row) for row in weights], list(wanted), []
+    for i, press in enumerate(presses):
+        usable = (press > 0) & (rows[i][i] > PARALLEL)
+        inverse.append(jnp.where(usable, 1.0 / jnp.where(usable, rows[i][i], 1.0), 0.0))
+        for j in range(i + 1, len(rows)):
+            share = rows[j][i] * inverse[i]
+            rows[j] = _plus(rows[j], -share, rows[i])
+            right[j] = right[j] - share * right[i]
+    forces = [None] * len(rows)
+    for i in reversed(range(len(rows))):
+        known = sum(rows[i][k] * forces[k] for k in range(i + 1, len(rows)))
+        forces[i] = (right[i] - known) * inverse[i]
+    return forces
 
 
 class _Contact(NamedTuple):
@@ -182,7 +228,7 @@ def _contact(surface: eqx.Module, t: ArrayLike, state: Particles, touching: Arra
 def _settle(contacts: list[_Contact], acceleration: list[Array]) -> tuple[list[Array], list[Array]]:
     """The acceleration that is left under normal forces and static friction, and the normal forces (projected Gauss-Seidel)."""
 
-    def sweep(_, forces):
+    def sweep(forces):
         total, normal_force, friction = forces
         normal_force, friction = list(normal_force), list(friction)
         for i, c in enumerate(contacts):
@@ -202,16 +248,27 @@ def _settle(contacts: list[_Contact], acceleration: list[Array]) -> tuple[list[A
     nothing = jnp.zeros_like(acceleration[0])
     forces = (acceleration, [nothing for _ in contacts], [[nothing for _ in acceleration] for _ in contacts])
     if len(contacts) == 1:
-        return sweep(0, forces)[:2]
-    return lax.fori_loop(0, SETTLING, sweep, forces)[:2]
+        return sweep(forces)[:2]
+    rounding = (4 * float(jnp.finfo(nothing.dtype).eps)) ** 2 * _dot(acceleration, acceleration)
+
+    def settling(carry):
+        return any_lane(carry[1])
+
+    def pass_(carry):
+        before, _ = carry
+        after = sweep(before)
+        moved = [a - b for a, b in zip(after[0], before[0], strict=True)]
+        return after, _dot(moved, moved) > rounding
+
+    return loop(settling, pass_, (forces, rounding >= 0), most=SETTLING)[0][:2]
 
 
-def _is_close(surface: eqx.Module, state: Particles, t: ArrayLike, dt: ArrayLike) -> Array:
+def _is_close(surface: eqx.Module, state: Particles, kick: Array, t: ArrayLike, dt: ArrayLike) -> Array:
     """Whether a lane is still where a step along the surface can have left it; a state set by hand need not be."""
     x, v = state
     relative = surface.relative(v)
     reach = 0.1 * dt * (jnp.sqrt(dot(relative, relative)) + jnp.sqrt(dot(v, v)))
-    rounding = 64 * float(jnp.finfo(state.dtype).eps) * jnp.sqrt(dot(x, x))
+    rounding = 64 * float(jnp.finfo(state.dtype).eps) * (jnp.sqrt(dot(x, x)) + dt * jnp.sqrt(kick))
     return jnp.abs(surface.gap(t, x)) <= reach + rounding
 
 

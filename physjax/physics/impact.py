@@ -16,7 +16,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
-from physjax.lanes import any_lane, apart, on_flagged
+from physjax.lanes import any_lane, apart, loop, on_flagged
 from physjax.physics.holding import Held, carried, hold, nothing_held
 from physjax.physics.rebound import rebound
 from physjax.scene import Function, Particles, Scene
@@ -157,10 +157,10 @@ def _answer(
         slowed = dot(relative, relative) < 0.25 * dot(before, before)  # else it only turned
         stopped = Particles(at.position, at.velocity - relative)
         state = _where(touches & (which == guard) & slowed, stopped, state)
-    bounced = touches & (which < len(walls))
+    bounced, kick = touches & (which < len(walls)), dot(acceleration, acceleration) * (dt * dt)
     for i, wall in enumerate(walls):
         # a bounce elsewhere throws a lane off what it touched, or into it: then that is a new touch
-        since[i] = jnp.where(bounced & (which != i) & _leaves(wall, t, state), jnp.inf, since[i])
+        since[i] = jnp.where(bounced & (which != i) & _leaves(wall, t, state, kick), jnp.inf, since[i])
     return state, tuple(since)
 
 
@@ -305,7 +305,7 @@ def _bracketed_root(
         return tuple(jnp.where(going, new, old) for new, old in zip(after, carry, strict=True))
 
     start = (high, low, below, above, below / (below - above), active & (high > low))
-    return lax.while_loop(going, closer, start)[0]
+    return loop(going, closer, start, most=200)[0]
 
 
 def _walls(scene: Scene) -> tuple:
@@ -318,11 +318,11 @@ def _faces(walls: tuple, t: ArrayLike, state: Particles) -> list:
     return [wall.facing(t, state.position) for wall in walls]
 
 
-def _leaves(wall: eqx.Module, t: ArrayLike, state: Particles) -> Array:
-    """Whether a lane is moving off a surface, or into it, by more than rounding."""
-    relative = wall.relative(state.velocity)
+def _leaves(wall: eqx.Module, t: ArrayLike, state: Particles, kick: Array) -> Array:
+    """Whether a lane is moving off a surface, or into it, by more than rounding of its speed and of a step's `kick`²."""
+    relative, eps = wall.relative(state.velocity), float(jnp.finfo(state.dtype).eps)
     normal_speed = dot(relative, wall.outward(t, state.position))
-    return normal_speed * normal_speed > float(jnp.finfo(state.dtype).eps) * dot(relative, relative)
+    return normal_speed * normal_speed > eps * dot(relative, relative) + (16 * eps) ** 2 * kick
 
 
 def _remembered(contacts: tuple, since: list) -> tuple:

@@ -246,6 +246,26 @@ def test_a_ball_comes_to_rest_in_a_wedge():
     assert min(float(side.gap(0.0, flight.position).min()) for side in sides) > -1e-12
     np.testing.assert_array_equal(flight.velocity[-100:], 0.0)
     assert np.ptp(np.asarray(flight.position[-1000:]), axis=0).max() < 1e-12
+    rests = [float(side.touching_since) for side in flight.final_scene.contacts]
+    assert 0.5 < min(rests) <= max(rests) < 1.5
+
+
+@pytest.mark.parametrize("opening", [30.0, 60.0, 90.0, 150.0])
+def test_a_block_slides_down_a_groove(opening):
+    """Two planes carry it, each with N = m g cosα/(2 sin(opening/2)), so that a = g (sinα - μ_k cosα/sin(opening/2))."""
+    half, slope, kinetic = np.deg2rad(opening / 2), 0.7, 0.1
+    along, up = np.array([0, -np.sin(slope), np.cos(slope)]), np.array([0, np.cos(slope), np.sin(slope)])
+    normals = [s * np.cos(half) * np.array([1.0, 0, 0]) + np.sin(half) * up for s in (1, -1)]
+    sides = [contacts.Plane((0.0, 0.0, 0.0), n, coulomb=contacts.Coulomb(0.2, kinetic)) for n in normals]
+    # a third and a fourth surface far away: more than a lane can lean on in space
+    far = [contacts.Sphere((0.0, 50.0, s * 50.0), 1.0) for s in (1, -1)]
+    still = Particles(jnp.zeros(3), jnp.zeros(3))
+    expected = G * (np.sin(slope) - kinetic * np.cos(slope) / np.sin(half))
+    for surfaces in (sides, [far[0], sides[0], far[1], sides[1]]):
+        block = Scene(still, forces=(forces.Gravity(G),), contacts=tuple(surfaces))
+        end = last(block, methods.rk4, dt=0.01, steps=100).state
+        np.testing.assert_allclose(end.velocity, expected * along, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(end.position, 0.5 * expected * along, rtol=1e-6, atol=1e-9)
 
 
 def test_the_lectures_friction_leaves_nothing_of_a_slide():
