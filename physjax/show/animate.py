@@ -26,8 +26,8 @@ def cloth(
     *,
     scene: int | Sequence[int] | None = None,
     color: Any = "#56B4E9",
-    fps: float = 30.0,
-    speed: float = 1.0,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
 ) -> Film:
     """A cloth, a jelly or a mesh as a shaded surface; see `plot.cloth`.
 
@@ -46,9 +46,9 @@ def springs(
     sheet: Any,
     *,
     scene: int | Sequence[int] | None = None,
-    limit: float | None = None,
-    fps: float = 30.0,
-    speed: float = 1.0,
+    limit: int | float | None = None,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
 ) -> Film:
     """Springs in the plane or in space, coloured by strain; see `plot.springs`, and `animate.cloth` for the errors."""
     who = "animate.springs"
@@ -64,9 +64,9 @@ def paths(
     *,
     every: int = 1,
     color: ArrayLike | None = None,
-    trail: float = 0.12,
-    fps: float = 30.0,
-    speed: float = 1.0,
+    trail: int | float = 0.12,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
 ) -> Film:
     """Particles as dots, with the way of the last `trail` seconds of film behind them, in one, two or three dimensions.
 

@@ -14,7 +14,7 @@ from physjax.show.takes import Take
 
 LONGEST = 600.0
 """A film that plays longer [s] is surely not meant."""
-GREYS = 32
+GREYS, NEARLY_GREY = 32, 8
 """Greys among the 256 colours of a GIF, which are the same for all its frames, so that nothing flickers."""
 HUNDREDTH = 0.01
 """A GIF counts time in hundredths of a second."""
@@ -31,7 +31,7 @@ class Film:
         self,
         scenery: Scenery,
         frames: Sequence[int],
-        fps: float,
+        fps: int | float,
         draw: Callable,
         *,
         bar: Callable | None = None,
@@ -110,8 +110,8 @@ class Film:
         return np.maximum(10 * np.diff(ends), 10).astype(int).tolist()
 
     def _write_html(self, file: Any, progress: bool) -> None:
-        page = f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n{self._player(progress)}</html>\n'
-        file.write(page.encode())
+        head = '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>physjax</title>\n'
+        file.write(f"{head}{self._player(progress)}</html>\n".encode())
 
     def _player(self, progress: bool) -> str:
         """The pictures with matplotlib's buttons, which bring their signs along instead of fetching them from a server."""
@@ -129,7 +129,7 @@ class Film:
         return before + _SIGNS + rest.partition(">")[2]
 
 
-def schedule(who: str, take: Take, fps: float, speed: float) -> tuple[list[int], float]:
+def schedule(who: str, take: Take, fps: int | float, speed: float) -> tuple[list[int], float]:
     """The frames of a run that a film shows, and its pictures a second: `fps`, or as many as the run has frames.
 
     Raises ValueError for a film that would be a single picture or play for longer than ten minutes.
@@ -171,9 +171,12 @@ def _palette(pictures: list[Any]) -> Any:
     together = Image.new("RGB", (width, height * len(pictures)))
     for place, picture in enumerate(pictures):
         together.paste(picture, (0, place * height))
-    greys = np.repeat(np.linspace(0, 255, GREYS).round().astype(int), 3).tolist()
+    # Pillow takes any colour that is about the nearest: what is almost a grey would take its place
+    found = np.array(together.quantize(256 - GREYS).getpalette()[: 3 * (256 - GREYS)]).reshape(-1, 3)
+    colours = found[np.ptp(found, axis=1) > NEARLY_GREY]
+    greys = np.repeat(np.linspace(0, 255, GREYS).round().astype(int), 3)
     palette = Image.new("P", (1, 1))
-    palette.putpalette(greys + together.quantize(256 - GREYS).getpalette()[: 3 * (256 - GREYS)])
+    palette.putpalette([*greys.tolist(), *colours.ravel().tolist()])
     return palette
 
 
@@ -184,11 +187,12 @@ def _counted(frames: Sequence[int], progress: bool) -> Iterator[int]:
 
 
 _SIGNS = """<style>
-.fa { font-style: normal; }
-.fa-minus::before { content: "\\2212"; } .fa-plus::before { content: "+"; }
-.fa-fast-backward::before { content: "\\23EE\\FE0E"; } .fa-fast-forward::before { content: "\\23ED\\FE0E"; }
-.fa-step-backward::before { content: "\\2039"; } .fa-step-forward::before { content: "\\203A"; }
-.fa-play::before { content: "\\25B6\\FE0E"; } .fa-play.fa-flip-horizontal::before { content: "\\25C0\\FE0E"; }
-.fa-pause::before { content: "\\23F8\\FE0E"; }
-.fa-reverse::before { content: "\\25C0\\FE0E"; }
+.animation .fa { font-style: normal; }
+.animation .fa-minus::before { content: "\\2212"; } .animation .fa-plus::before { content: "+"; }
+.animation .fa-fast-backward::before { content: "\\23EE\\FE0E"; }
+.animation .fa-fast-forward::before { content: "\\23ED\\FE0E"; }
+.animation .fa-step-backward::before { content: "\\2039"; } .animation .fa-step-forward::before { content: "\\203A"; }
+.animation .fa-play::before { content: "\\25B6\\FE0E"; }
+.animation .fa-play.fa-flip-horizontal::before { content: "\\25C0\\FE0E"; }
+.animation .fa-pause::before { content: "\\23F8\\FE0E"; }
 </style>"""

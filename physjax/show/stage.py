@@ -8,8 +8,8 @@ from physjax.show.takes import Take
 
 ELEVATION, AZIMUTH = 16.0, 28.0
 """From where space is seen [degrees]: from above, and turned from the z axis towards x."""
-FARTHEST = 3.0
-"""Once a run has blown up, frames so many times larger than the middle one do not set the limits."""
+FARTHEST = 4.0
+"""Of a run that blew up, frames so many times larger than its first do not set the limits."""
 
 
 class Stage(NamedTuple):
@@ -46,7 +46,7 @@ def stage_of(take: Take, frames: Any) -> Stage:
     low, high = np.nanmin(seen, axis=1), np.nanmax(seen, axis=1)
     if take.blew_up:
         extent = (high - low).max(axis=-1)
-        modest = extent <= FARTHEST * max(np.median(extent), extent[0])
+        modest = extent <= FARTHEST * (extent[0] or extent[extent > 0].min(initial=np.inf))
         low, high = low[modest], high[modest]
     return Stage(low.min(axis=0), high.max(axis=0))
 

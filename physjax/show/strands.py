@@ -9,12 +9,14 @@ import numpy as np
 from physjax.physics.springs import Springs
 from physjax.show import obstacles
 from physjax.show.panels import Scenery, panels, scenery_of
-from physjax.show.stage import FARTHEST
 from physjax.show.takes import Take, batch_index, picked, springs_of, take, unbroken
 from physjax.trajectory import Trajectory
 
 MOST = 99.0
 """The colours reach to this percentile of the strains; arrows on the colour bar say that some go beyond."""
+
+TWICE = 1.0
+"""The colours of a run that blew up reach no farther: a spring of twice its length."""
 
 
 class Strands(NamedTuple):
@@ -47,7 +49,7 @@ def springs(
     frames: int | Iterable[int] | None = None,
     *,
     scene: int | Sequence[int] | None = None,
-    limit: float | None = None,
+    limit: int | float | None = None,
     figure: Any = None,
 ) -> Any:
     """Draw springs in the plane or in space at chosen frames, coloured by strain; broken ones are dashed grey lines.
@@ -71,7 +73,7 @@ def take_springs(who: str, film: Any, sheet: Any, scene: Any) -> tuple[Take, Spr
 
 
 def strands_of(
-    who: str, film: Trajectory, given: Springs, index: tuple, seen: Take, frames: Any, limit: float | None
+    who: str, film: Trajectory, given: Springs, index: tuple, seen: Take, frames: Any, limit: int | float | None
 ) -> Strands:
     """What is known of the springs at all frames; the colours' scale fits the given frames."""
     held = unbroken(who, film, given, index)
@@ -79,8 +81,7 @@ def strands_of(
     strands = Strands(given.pairs, rest, held, 1.0)
     if limit is None:
         most = [_most(strands, seen.position[frame].astype(float), frame) for frame in frames]
-        # what flies apart at last would leave no colours for what came before
-        limit = min(max(most), FARTHEST * np.median(most) if seen.blew_up else np.inf)
+        limit = min(max(most), TWICE if seen.blew_up else np.inf)
     elif not limit > 0:
         raise ValueError(f"{who}: got limit={limit}, expected a strain > 0, e.g. 0.05 for five per cent.")
     return strands._replace(limit=float(limit) or 0.01)
@@ -107,7 +108,7 @@ def lines(ax: Any, scenery: Scenery, frame: int, *, strands: Strands) -> list[An
     held = seen if strands.held is None else seen & strands.held[frame]
     colours = strands.colours().to_rgba(100 * strands.strain(position)[held])
     width = float(np.clip(60 / np.sqrt(len(ends)), 0.5, 2.2))
-    drawn = [_collection(ends[held], colors=colours, linewidths=width, zorder=3)]
+    drawn = [_collection(ends[held], colors=colours, linewidths=width, zorder=3)] if held.any() else []
     if (seen & ~held).any():
         drawn.append(_collection(ends[seen & ~held], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2))
     for collection in drawn:
