@@ -9,6 +9,7 @@ import numpy as np
 
 from physjax.checks import real_quantity
 from physjax.files import replacing
+from physjax.show import obstacles
 from physjax.show.panels import Scenery, arranged
 from physjax.show.takes import Take
 
@@ -81,12 +82,16 @@ class Film:
         (ax,) = self._axes(figure, self.scenery, 1, self._bar)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # laid out once: nothing moves but what moves
+        moves = obstacles.moving(self.scenery.contacts)
+        if not moves:
+            self.scenery.obstacles(ax, self.frames[0])
         on_screen: list[Any] = []
 
         def show(frame: int) -> None:
             for artist in on_screen:
                 artist.remove()
-            on_screen[:] = self.scenery.obstacles(ax, frame) + self._draw(ax, self.scenery, frame)
+            on_screen[:] = self.scenery.obstacles(ax, frame) if moves else []
+            on_screen.extend(self._draw(ax, self.scenery, frame))
             ax.title.set_text(self.scenery.take.title(frame))
 
         return figure, show

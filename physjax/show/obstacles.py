@@ -5,6 +5,7 @@ lane are left out.
 """
 
 import math
+from collections.abc import Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -38,11 +39,11 @@ def shown(contacts: tuple) -> tuple[Contact, ...]:
     return tuple(contact for contact in contacts if _is_shared(contact))
 
 
-def with_obstacles(stage: Stage, contacts: tuple) -> Stage:
-    """The box with balls and rooms inside, and with floors that are near; far larger ones do not count."""
+def with_obstacles(stage: Stage, contacts: tuple, times: Sequence[float] = (0.0,)) -> Stage:
+    """The box with balls and rooms inside, at those times, and with floors that are near; far larger ones do not count."""
     low, high = stage
-    for contact in contacts:
-        for corner in _corners(contact, stage):
+    for contact, t in product(contacts, times):
+        for corner in _corners(contact, stage, t):
             if np.abs(corner - (low + high) / 2).max() <= 2.5 * max(stage.size, 1e-12):
                 stage = stage.around(corner, corner)
     return stage
@@ -78,24 +79,25 @@ def in_space(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
             ax.add_collection3d(drawn[-1])
     for contact in contacts:
         if isinstance(contact, Sphere) and contact.inside:
-            bowl = _sphere(contact, t)
+            bowl = _within(stage, _sphere(contact, t))
             far = (bowl.corners.mean(axis=1) - _center(contact, t))[:, 1] < 0
             drawn.append(Poly3DCollection(bowl.corners[far], facecolors=GREY, linewidths=0, alpha=0.12, zorder=0))
             ax.add_collection3d(drawn[-1])
     return drawn
 
 
-def balls(contacts: tuple, t: float) -> list[Ball]:
-    """The balls in the way at a time, as flat patches."""
-    return [_sphere(c, t, BALL) for c in contacts if isinstance(c, Sphere) and not c.inside]
+def balls(stage: Stage, contacts: tuple, t: float) -> list[Ball]:
+    """The balls in the way at a time, as flat patches, as far as they are in the picture."""
+    spheres = [_sphere(c, t, BALL) for c in contacts if isinstance(c, Sphere) and not c.inside]
+    return [_within(stage, ball) for ball in spheres]
 
 
-def solid(ax: Any, contacts: tuple, t: float) -> list[Any]:
+def solid(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
     """Draw the balls in the way, behind what moves."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     drawn = []
-    for ball in balls(contacts, t):
+    for ball in balls(stage, contacts, t):
         lit = shades(ball)
         drawn.append(Poly3DCollection(ball.corners, facecolors=lit, edgecolors=lit, linewidths=0.3, zorder=1))
         ax.add_collection3d(drawn[-1])
@@ -124,6 +126,11 @@ def shades(ball: Ball) -> np.ndarray:
     return (0.72 + 0.28 * np.maximum(ball.normals @ LIGHT, 0))[:, None] * to_rgb(STONE)
 
 
+def moving(contacts: tuple) -> bool:
+    """Whether any of them has to be drawn anew for every frame; what does not say that it moves stands still."""
+    return any(getattr(contact, "velocity", None) is not None for contact in contacts)
+
+
 def _is_shared(contact: Contact) -> bool:
     vectors = [getattr(contact, name, None) for name in ("point", "normal", "center", "lower", "upper", "velocity")]
     numbers = [getattr(contact, name, None) for name in ("radius", "thickness")]
@@ -132,17 +139,17 @@ def _is_shared(contact: Contact) -> bool:
     )
 
 
-def _corners(contact: Contact, stage: Stage) -> list[np.ndarray]:
+def _corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
     """Points that belong into the picture."""
     if isinstance(contact, Sphere):
-        center, radius = _center(contact, 0.0), float(contact.radius)
+        center, radius = _center(contact, t), float(contact.radius)
         return [center - radius, center + radius]
     if isinstance(contact, Room):
-        return [np.asarray(contact.lower, float), np.asarray(contact.upper, float)]
+        return [np.asarray(corner, float) + _shift(contact, t) for corner in (contact.lower, contact.upper)]
     if not isinstance(contact, Plane):
         return []
     normal, corners = _unit(contact.normal), np.array(list(product(*zip(*stage, strict=True))))
-    gaps = (corners - np.asarray(contact.point, float)) @ normal
+    gaps = (corners - _center(contact, t)) @ normal
     nearest = np.abs(gaps).argmin()
     near = gaps.min() > 0 and gaps[nearest] <= NEAR * stage.size
     return [corners[nearest] - gaps[nearest] * normal] if near else []
@@ -197,6 +204,11 @@ def _sphere(sphere: Sphere, t: float, shrunk: float = 1.0, rings: int = 24) -> B
     normals /= np.sqrt((normals * normals).sum(axis=-1, keepdims=True))
     center, radius = _center(sphere, t), shrunk * float(sphere.radius)
     return Ball(center + radius * quads, normals, center, radius)
+
+
+def _within(stage: Stage, ball: Ball) -> Ball:
+    inside = stage.holds(ball.corners).all(axis=1)
+    return ball._replace(corners=ball.corners[inside], normals=ball.normals[inside])
 
 
 def _center(contact: Contact, t: float) -> np.ndarray:

@@ -46,7 +46,7 @@ class Scenery(NamedTuple):
 def scenery_of(take: Take, frames: Any) -> Scenery:
     """The film and a box that holds the given frames, with what is in the way."""
     contacts = obstacles.shown(take.surfaces)
-    stage = obstacles.with_obstacles(stage_of(take, frames), contacts)
+    stage = obstacles.with_obstacles(stage_of(take, frames), contacts, take.time[[min(frames), max(frames)]])
     return Scenery(take, stage.grown(0.03), contacts)
 
 
@@ -75,7 +75,7 @@ def arranged(figure: Any, scenery: Scenery, count: int, bar: Any = None) -> list
         width = WIDTH if columns * across > 0.8 * up else WIDTH * 0.7
         height = float(np.clip(width / columns * up / across, 1.0, 5.0)) + above + 0.35
         figure.set_size_inches(width, rows * height + below)
-        figure.set_layout_engine("constrained")
+        figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
         for ax in drawn[:-columns]:
             ax.set_xlabel("")
         for place, ax in enumerate(drawn):

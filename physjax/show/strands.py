@@ -113,7 +113,11 @@ def lines(ax: Any, scenery: Scenery, frame: int, *, strands: Strands) -> list[An
         drawn.append(_collection(ends[seen & ~held], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2))
     for collection in drawn:
         (ax.add_collection if scenery.flat else ax.add_collection3d)(collection)
-    return drawn if scenery.flat else drawn + obstacles.solid(ax, scenery.contacts, scenery.take.time[frame])
+    return (
+        drawn
+        if scenery.flat
+        else drawn + obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame])
+    )
 
 
 def colour_bar(figure: Any, where: dict[str, Any], *, strands: Strands) -> None:

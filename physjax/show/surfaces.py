@@ -51,7 +51,7 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     position = scenery.position(frame)
     faces = faces[scenery.stage.holds(position)[faces].all(axis=1)]
     triangles, colours = position[faces], brightness(position, faces)[:, None] * to_rgb(color)
-    balls = obstacles.balls(scenery.contacts, scenery.take.time[frame])
+    balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
     behind = obstacles.hidden(balls, triangles.mean(axis=1), ax)
     groups = [(triangles[behind], colours[behind], 2), (triangles[~behind], colours[~behind], 4)]
     groups += [(ball.corners, obstacles.shades(ball), 3) for ball in balls]

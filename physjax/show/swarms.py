@@ -33,7 +33,7 @@ class Swarm(NamedTuple):
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
         trail = ax.add_collection3d(Line3DCollection(pieces, colors=colours, linewidths=1.2, zorder=3))
-        balls = obstacles.solid(ax, scenery.contacts, scenery.take.time[frame])
+        balls = obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame])
         return [trail, ax.scatter(*position[seen].T, depthshade=True, **dots), *balls]
 
     def _trail(self, take: Take, frame: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from physjax import Particles, Scene, animate, forces, methods, simulate
+from physjax import Particles, Scene, animate, contacts, forces, methods, simulate
 from physjax.show.films import schedule
 from physjax.show.takes import Take
 
@@ -95,7 +95,7 @@ def test_a_page_holds_all_its_pictures_and_fetches_nothing(ruin, tmp_path, capsy
     film.save(tmp_path / "film.html")
     page = (tmp_path / "film.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == len(film.frames) == 21
-    assert "http" not in page
+    assert "://" not in page
     assert "<link" not in page
     assert page.startswith("<!doctype html>")
     assert "/21 [" in capsys.readouterr().err
@@ -160,6 +160,17 @@ def test_dots_in_the_plane_stand_where_the_balls_are_with_a_trail_behind(swarm):
     np.testing.assert_allclose(trail.get_segments()[-1], swarm.position[14:16, 10])
     assert trail.get_colors()[0, 3] < trail.get_colors()[-1, 3]
     assert len(np.unique(dots.get_facecolors(), axis=0)) == 6
+
+
+def test_a_wall_that_moves_is_drawn_where_it_is():
+    piston = contacts.Plane((0.0, 0.0), (1.0, 0.0), velocity=(1.0, 0.0), response=contacts.project)
+    state = Particles(np.array([[0.05, 0.0], [2.0, 1.0]]), np.zeros((2, 2)))
+    film = animate.paths(simulate(Scene(state, contacts=(piston,)), methods.verlet, dt=0.1, steps=10))
+    figure, show = film._projector()
+    for frame in (0, 10, 4):
+        show(frame)
+        _wrong_side, edge, _trail, _dots = figure.axes[0].collections
+        np.testing.assert_allclose(edge.get_paths()[0].vertices[:, 0], 0.1 * frame, atol=1e-12)
 
 
 def test_particles_on_a_line_stand_side_by_side():

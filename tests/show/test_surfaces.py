@@ -41,7 +41,9 @@ def test_every_face_is_drawn_at_every_frame_that_was_asked_for(drape):
     assert [ax.get_title() for ax in figure.axes] == ["t = 0.000 s", "t = 0.233 s", "t = 0.500 s"]
     for ax in figure.axes:
         assert polygons(ax) == len(sheet.faces) == 40
-        assert polygons(ax, zorders=(3,)) == len(obstacles.balls(film.scene.contacts, 0.0)[0].corners)
+        assert polygons(ax, zorders=(3,)) == len(
+            obstacles.balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[0].corners
+        )
         assert polygons(ax, zorders=(0,)) == 1  # the floor
         assert len(ax.collections) <= 4  # however many faces
     assert len(plot.cloth(film, sheet, 3).axes) == 1
@@ -183,7 +185,11 @@ def test_every_shape_is_drawn_in_space():
 
 def test_surfaces_that_move_are_drawn_where_they_are_and_those_that_differ_are_left_out():
     bat = contacts.Sphere((0, 0, 0), 0.1, velocity=(2.0, 0, 0))
-    np.testing.assert_allclose(obstacles.balls((bat,), 0.5)[0].center, [1.0, 0, 0])
+    (ball,) = obstacles.balls(CUBE, (bat,), 0.25)
+    np.testing.assert_allclose(ball.center, [0.5, 0, 0])
+    assert len(ball.corners) == len(ball.normals) > 100
+    assert len(obstacles.balls(CUBE, (bat,), 1.0)[0].corners) == 0
+    assert obstacles.with_obstacles(CUBE, (bat,), (0.0, 0.75)).high[0] == 1.6
     ramp = contacts.Plane(np.zeros((4, 3)), (0, 1, 0))
     assert obstacles.shown((bat, ramp)) == (bat,)
 
@@ -193,7 +199,7 @@ def test_what_is_behind_a_ball_is_known(drape):
     ax = plot.cloth(film, sheet, 0).axes[0]
     up, turn = np.radians([ax.elev, ax.azim])
     eye = np.array([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)])
-    ball = obstacles.balls(film.scene.contacts, 0.0)
+    ball = obstacles.balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)
     points = ball[0].center + np.array([eye, -eye, -eye + [0, 1.0, 0]]) * 0.4
     assert obstacles.hidden(ball, points, ax).tolist() == [False, True, False]
 
