@@ -49,7 +49,7 @@ def style(method: str) -> dict[str, Any]:
 
 
 def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None, ax: Any = None) -> Any:
-    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three.
+    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three, y up.
 
     `every` draws one lane in so many; `color` colours lanes by a value each. Returns the axes.
     """
