@@ -13,7 +13,7 @@ from physjax.trajectory import Trajectory
 if TYPE_CHECKING:
     from physjax import scenes
     from physjax.physics import contacts, lattices, springs
-    from physjax.show import plot
+    from physjax.show import animate, plot
     from physjax.study import accuracy, energy, projectile
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "Scene",
     "Trajectory",
     "accuracy",
+    "animate",
     "contacts",
     "energy",
     "forces",
@@ -43,6 +44,7 @@ __version__ = "0.1.0"
 # loaded when first named: what not every run needs should not make `import physjax` slower
 _LATER = {
     "accuracy": "physjax.study.accuracy",
+    "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
     "lattices": "physjax.physics.lattices",

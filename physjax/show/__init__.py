@@ -1,1 +1,1 @@
-"""What you look at: plots and reports."""
+"""What you look at: plots, films and reports."""

@@ -10,8 +10,13 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.show.report import seconds_text
+from physjax.show.stage import AZIMUTH, ELEVATION
+from physjax.show.strands import springs
+from physjax.show.surfaces import cloth
 from physjax.stepping.methods import METHODS
 from physjax.trajectory import Trajectory
+
+__all__ = ["cloth", "paths", "springs", "style", "work_precision"]
 
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
 """Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""
@@ -44,7 +49,7 @@ def style(method: str) -> dict[str, Any]:
 
 
 def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None, ax: Any = None) -> Any:
-    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three.
+    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three, y up.
 
     `every` draws one lane in so many; `color` colours lanes by a value each. Returns the axes.
     """
@@ -63,6 +68,8 @@ def _paths(time: np.ndarray, position: np.ndarray, every: int, color: Any, ax: A
     position = position[:, ::every]
     if ax is None:
         ax = plt.figure(figsize=(6, 4), layout="constrained").add_subplot(projection="3d" if dim == 3 else None)
+        if dim == 3:
+            ax.view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="y")
     count = position.shape[1]
     shade = np.arange(count) if color is None else np.asarray(color).ravel()[::every]
     span = np.ptp(shade) or 1.0

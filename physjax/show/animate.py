@@ -1,0 +1,85 @@
+"""Runs as films in real time: cloth, springs, and particles with a trail behind them.
+
+Every function returns a `Film`, which shows itself in a notebook and has `.save("name.gif")` and `.save("name.html")`.
+It plays `speed` seconds of the run a second, in `fps` pictures, which are picked by the film's own time.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from jax.typing import ArrayLike
+
+from physjax.checks import positive_integer, real_quantity
+from physjax.show.films import Film, schedule
+from physjax.show.panels import scenery_of
+from physjax.show.strands import colour_bar, lines, strands_of, take_springs
+from physjax.show.surfaces import surface
+from physjax.show.swarms import swarm_of, swarm_scenery
+from physjax.show.takes import faces_of, take, take_lanes
+from physjax.trajectory import Trajectory
+
+
+def cloth(
+    film: Trajectory,
+    sheet: Any,
+    *,
+    scene: int | Sequence[int] | None = None,
+    color: Any = "#56B4E9",
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
+) -> Film:
+    """A cloth, a jelly or a mesh as a shaded surface; see `plot.cloth`.
+
+    A run that blew up is shown until its last good frame, and the title says so. Raises TypeError or ValueError for a
+    film, a sheet, `fps` or `speed` that do not fit.
+    """
+    who = "animate.cloth"
+    faces, nodes = faces_of(who, sheet)
+    seen = take(who, film, scene=scene, nodes=nodes, dims=(3,))
+    frames, fps = schedule(who, seen, fps, speed)
+    return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color))
+
+
+def springs(
+    film: Trajectory,
+    sheet: Any,
+    *,
+    scene: int | Sequence[int] | None = None,
+    limit: int | float | None = None,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
+) -> Film:
+    """Springs in the plane or in space, coloured by strain; see `plot.springs`, and `animate.cloth` for the errors."""
+    who = "animate.springs"
+    seen, given, index = take_springs(who, film, sheet, scene)
+    frames, fps = schedule(who, seen, fps, speed)
+    strands = strands_of(who, film, given, index, seen, frames, limit)
+    bar = partial(colour_bar, strands=strands)
+    return Film(scenery_of(seen, frames), frames, fps, partial(lines, strands=strands), bar=bar)
+
+
+def paths(
+    film: Trajectory,
+    *,
+    every: int = 1,
+    color: ArrayLike | None = None,
+    trail: int | float = 0.12,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
+) -> Film:
+    """Particles as dots, with the way of the last `trail` seconds of film behind them, in one, two or three dimensions.
+
+    In one dimension they stand side by side and move up and down. `every` draws one lane in so many, `color` colours
+    lanes by a value each. Lanes that blew up vanish. Raises TypeError or ValueError for what does not fit.
+    """
+    who = "animate.paths"
+    every, trail = positive_integer("every", every), float(real_quantity("trail [s]", trail, at_least=0))
+    seen = take_lanes(who, film)
+    frames, fps = schedule(who, seen, fps, speed)
+    seen, draw = swarm_of(who, seen, every, color, trail * speed)
+    scenery, axes = swarm_scenery(seen, frames)
+    return Film(scenery, frames, fps, draw, axes=axes)
+
+
+__all__ = ["Film", "cloth", "paths", "springs"]

@@ -1,0 +1,203 @@
+"""Films: pictures in real time that show themselves in a notebook and are saved as a GIF or as a page of their own."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physjax.checks import real_quantity
+from physjax.files import replacing
+from physjax.show import obstacles
+from physjax.show.panels import Scenery, arranged
+from physjax.show.takes import Take
+
+LONGEST = 600.0
+"""A film that plays longer [s] is surely not meant."""
+GREYS, NEARLY_GREY = 32, 8
+"""Greys among the 256 colours of a GIF, which are the same for all its frames, so that nothing flickers."""
+HUNDREDTH = 0.01
+"""A GIF counts time in hundredths of a second."""
+
+
+class Film:
+    """Frames of a run as a film of `fps` pictures a second, drawn when it is shown or saved.
+
+    In a notebook it shows itself, with buttons. `.save` writes it, `.still` draws a single picture of it. `frames` are the
+    numbers of the run's frames that are shown. All pictures have the same limits.
+    """
+
+    def __init__(
+        self,
+        scenery: Scenery,
+        frames: Sequence[int],
+        fps: int | float,
+        draw: Callable,
+        *,
+        bar: Callable | None = None,
+        axes: Callable = arranged,
+        dpi: int = 100,
+    ):
+        self.scenery, self.frames, self.fps, self.dpi = scenery, tuple(frames), fps, dpi
+        self._draw, self._bar, self._axes = draw, bar, axes
+
+    def __repr__(self) -> str:
+        return f"<Film of {len(self.frames)} pictures, {len(self.frames) / self.fps:.3g} s at {self.fps:.3g} a second>"
+
+    def still(self, number: int) -> Any:
+        """The figure of one picture, counted from 0 or, if negative, from the end."""
+        if not -len(self.frames) <= number < len(self.frames):
+            raise IndexError(f"still: got picture {number}, expected {-len(self.frames)} to {len(self.frames) - 1}.")
+        figure, show = self._projector()
+        show(self.frames[number])
+        return figure
+
+    def save(self, path: str | os.PathLike, *, progress: bool = True) -> Path:
+        """Write a GIF or a page that needs nothing else, by the ending of `path`; the file is whole or absent.
+
+        Raises ValueError for another ending and FileNotFoundError where there is no such folder, before anything is
+        drawn. Returns the path.
+        """
+        path = Path(path)
+        writers = {".gif": self._write_gif, ".html": self._write_html}
+        if path.suffix.lower() not in writers:
+            raise ValueError(f"save: got {path.name}, expected a name that ends in {' or '.join(writers)}.")
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist. Create it first.")
+        with replacing(path, "wb") as file:
+            writers[path.suffix.lower()](file, progress)
+        return path
+
+    def _repr_html_(self) -> str:
+        return self._player(progress=True)
+
+    def _projector(self) -> tuple[Any, Callable]:
+        """A figure, and what shows a frame of the run in it; pyplot knows nothing of it, and does not show it again."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(dpi=self.dpi)
+        FigureCanvasAgg(figure)
+        (ax,) = self._axes(figure, self.scenery, 1, self._bar)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once: nothing moves but what moves
+        moves = obstacles.moving(self.scenery.contacts)
+        if not moves:
+            self.scenery.obstacles(ax, self.frames[0])
+        on_screen: list[Any] = []
+
+        def show(frame: int) -> None:
+            for artist in on_screen:
+                artist.remove()
+            on_screen[:] = self.scenery.obstacles(ax, frame) if moves else []
+            on_screen.extend(self._draw(ax, self.scenery, frame))
+            ax.title.set_text(self.scenery.take.title(frame))
+
+        return figure, show
+
+    def _write_gif(self, file: Any, progress: bool) -> None:
+        figure, show = self._projector()
+        palette = _palette(
+            [_picture(figure, show, self.frames[int(i)]) for i in np.linspace(0, len(self.frames) - 1, 3)]
+        )
+        pictures = (
+            _picture(figure, show, frame).quantize(palette=palette, dither=0)
+            for frame in _counted(self.frames, progress)
+        )
+        next(pictures).save(
+            file, "GIF", save_all=True, append_images=pictures, duration=self._durations(), loop=0, optimize=False
+        )
+
+    def _durations(self) -> list[int]:
+        """How long each picture stands [ms]: hundredths of a second that together keep real time."""
+        ends = np.round(np.arange(len(self.frames) + 1) / self.fps / HUNDREDTH)
+        return np.maximum(10 * np.diff(ends), 10).astype(int).tolist()
+
+    def _write_html(self, file: Any, progress: bool) -> None:
+        head = '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>physjax</title>\n'
+        file.write(f"{head}{self._player(progress)}</html>\n".encode())
+
+    def _player(self, progress: bool) -> str:
+        """The pictures with matplotlib's buttons, which bring their signs along instead of fetching them from a server."""
+        from matplotlib import rc_context
+        from matplotlib.animation import FuncAnimation
+
+        figure, show = self._projector()
+        bar = _counted(self.frames, progress)
+        film = FuncAnimation(
+            figure, show, frames=bar, init_func=lambda: None, save_count=len(self.frames), cache_frame_data=False
+        )
+        with rc_context({"animation.embed_limit": 2**20, "savefig.bbox": "standard"}):
+            player = film.to_jshtml(fps=self.fps, embed_frames=True, default_mode="loop")
+        before, _, rest = player.partition("<link")
+        return before + _SIGNS + rest.partition(">")[2]
+
+
+def schedule(who: str, take: Take, fps: int | float, speed: float) -> tuple[list[int], float]:
+    """The frames of a run that a film shows, and its pictures a second: `fps`, or as many as the run has frames.
+
+    Raises ValueError for a film that would be a single picture or play for longer than ten minutes.
+    """
+    fps, speed = (
+        float(real_quantity(f"{who}: {n}", v, above=0)) for n, v in (("fps [1/s]", fps), ("speed [1]", speed))
+    )
+    time = take.time[: take.good]
+    if len(time) == 1:
+        raise ValueError(f"{who}: got a film with one good frame, expected at least two; plot shows a single one.")
+    span = (time[-1] - time[0]) / speed
+    fps = min(fps, (len(time) - 1) / span)
+    count = round(span * fps)
+    if count < 1 or span > LONGEST:
+        raise ValueError(
+            f"{who}: got a run of {time[-1] - time[0]:.3g} s, which at speed={speed:g} plays for {span:.3g} s; expected "
+            f"two pictures to {LONGEST:g} s. With speed={(time[-1] - time[0]) / 10:.2g} it takes ten seconds."
+        )
+    wanted = time[0] + np.arange(count + 1) * speed / fps
+    after = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
+    nearest = after - (wanted - time[after - 1] < time[after] - wanted)
+    nearest[-1] = len(time) - 1  # the end is always seen
+    return nearest.tolist(), fps
+
+
+def _picture(figure: Any, show: Callable, frame: int) -> Any:
+    from PIL import Image
+
+    show(frame)
+    figure.canvas.draw()
+    return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+
+
+def _palette(pictures: list[Any]) -> Any:
+    """A palette of greys, white and black among them, and of the colours that some pictures have in common."""
+    from PIL import Image
+
+    width, height = pictures[0].size
+    together = Image.new("RGB", (width, height * len(pictures)))
+    for place, picture in enumerate(pictures):
+        together.paste(picture, (0, place * height))
+    # Pillow takes any colour that is about the nearest: what is almost a grey would take its place
+    found = np.array(together.quantize(256 - GREYS).getpalette()[: 3 * (256 - GREYS)]).reshape(-1, 3)
+    colours = found[np.ptp(found, axis=1) > NEARLY_GREY]
+    greys = np.repeat(np.linspace(0, 255, GREYS).round().astype(int), 3)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*greys.tolist(), *colours.ravel().tolist()])
+    return palette
+
+
+def _counted(frames: Sequence[int], progress: bool) -> Iterator[int]:
+    from tqdm import tqdm
+
+    return iter(tqdm(frames, desc="drawing", unit="picture", disable=not progress, leave=False))
+
+
+_SIGNS = """<style>
+.animation .fa { font-style: normal; }
+.animation .fa-minus::before { content: "\\2212"; } .animation .fa-plus::before { content: "+"; }
+.animation .fa-fast-backward::before { content: "\\23EE\\FE0E"; }
+.animation .fa-fast-forward::before { content: "\\23ED\\FE0E"; }
+.animation .fa-step-backward::before { content: "\\2039"; } .animation .fa-step-forward::before { content: "\\203A"; }
+.animation .fa-play::before { content: "\\25B6\\FE0E"; }
+.animation .fa-play.fa-flip-horizontal::before { content: "\\25C0\\FE0E"; }
+.animation .fa-pause::before { content: "\\23F8\\FE0E"; }
+</style>"""

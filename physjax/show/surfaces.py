@@ -1,0 +1,85 @@
+"""Cloth, jelly and meshes as shaded surfaces."""
+
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from physjax.show import obstacles
+from physjax.show.obstacles import LIGHT
+from physjax.show.panels import Scenery, panels, scenery_of
+from physjax.show.takes import faces_of, picked, take
+from physjax.trajectory import Trajectory
+
+AMBIENT = 0.5
+"""Brightness of a face that stands edge on to the light."""
+
+
+SMOOTH = 0.85
+"""Cosine of the angle up to which faces are drawn as one smooth surface."""
+
+
+def cloth(
+    film: Trajectory,
+    sheet: Any,
+    frames: int | Iterable[int] | None = None,
+    *,
+    scene: int | Sequence[int] | None = None,
+    color: Any = "#56B4E9",
+    figure: Any = None,
+) -> Any:
+    """Draw the faces of a cloth, a jelly or a mesh in space at chosen frames, side by side, shaded by Lambert's law.
+
+    `sheet` is the lattice that the film's scene was made from. `frames` are numbers of frames, negative ones from the
+    end; without them the first, the middle and the last good one. Of a batch of scenes `scene` picks one. y is up, all
+    directions have the same scale [m], and balls, floors and rooms of the scene are drawn lightly. Returns the figure.
+    Raises TypeError, ValueError or IndexError for a film, a sheet or frames that do not fit.
+    """
+    who = "plot.cloth"
+    faces, nodes = faces_of(who, sheet)
+    seen = take(who, film, scene=scene, nodes=nodes, dims=(3,))
+    chosen = picked(who, seen, frames)
+    return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color), figure)
+
+
+def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any) -> list[Any]:
+    """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them."""
+    from matplotlib.colors import to_rgb
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    position = scenery.position(frame)
+    faces = faces[scenery.stage.holds(position)[faces].all(axis=1)]
+    triangles, colours = position[faces], brightness(position, faces)[:, None] * to_rgb(color)
+    balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
+    behind = obstacles.hidden(balls, triangles.mean(axis=1), ax)
+    groups = [(triangles[behind], colours[behind], 2), (triangles[~behind], colours[~behind], 4)]
+    groups += [(ball.corners, obstacles.shades(ball), 3) for ball in balls]
+    drawn = [
+        Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
+        for polygons, shades, order in groups
+        if len(polygons)
+    ]
+    for collection in drawn:
+        ax.add_collection3d(collection)
+    return drawn
+
+
+def brightness(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Lambert's law, seen from both sides: ambient light and the rest times |n·l|, for each face.
+
+    n at a corner is the mean of the faces around it, by area, so that a coarse sheet looks as smooth as it is meant;
+    where they turn sharply, as on the edge of a block, it is the face's own.
+    """
+    a, b, c = position[faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    corners, weights = faces.ravel(), np.repeat(normal, 3, axis=0)
+    around = np.stack([np.bincount(corners, weights[:, i], len(position)) for i in range(3)], axis=-1)
+    own, mean = _unit(normal)[:, None], _unit(around)[faces]
+    smooth = (own * mean).sum(axis=-1, keepdims=True) > SMOOTH
+    return AMBIENT + (1 - AMBIENT) * np.abs(np.where(smooth, mean, own) @ LIGHT).mean(axis=1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    return vectors / np.where(length > 0, length, 1.0)
