@@ -35,7 +35,7 @@ DETAIL = 12
 """Moments of the reference path for every one at which errors are measured."""
 
 FINE, COARSER = 16, 11
-"""Steps between two of those moments where rk4 must be the reference because there are contacts, and to estimate its error."""
+"""Steps between two of those moments where rk4 must be the reference since diffrax cannot be, and to estimate its error."""
 
 
 class Budget(NamedTuple):
@@ -72,19 +72,22 @@ def work_precision(
     `problem` is a gallery problem, or a scene with its `duration` [s] and, if known, its closed form `exact(times)`.
     `methods`: all of the registry by default. `dts` [s]: from coarse to fine within the budget by default; each is
     rounded so that a whole number of steps fits between the moments compared. `rivals`: diffrax solvers, run adaptively
-    at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts. The truth is the closed form
-    where there is one, else diffrax's Dopri8 at 1e-13, or our own rk4 with fine steps where there are contacts; its own
-    error is the floor of the result. Where impacts are timed (`contacts.impact`), every method runs once more with
-    `contacts.project`, the lecture's answer at the end of the step, as "rk4, projected": what that does to the order.
-    Compiles once per method and treatment. `progress(what)` is called before each method. Raises ValueError for a
-    missing duration or bad steps.
+    at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts or forces that remember. The
+    truth is the closed form where there is one, else diffrax's Dopri8 at 1e-13, or, where diffrax has no rivals either,
+    our own rk4 with fine steps; its own error is the floor of the result. Where impacts are timed (`contacts.impact`),
+    every method runs once more with `contacts.project`, the lecture's answer at the end of the step, as "rk4,
+    projected": what that does to the order. Compiles once per method and treatment. `progress(what)` is called before
+    each method. Raises ValueError for a missing duration or bad steps.
     """
     problem = _as_problem(problem, duration, exact, conserved)
     methods = list(METHODS.values()) if methods is None else list(methods)
     if rivals is None:
-        rivals = () if problem.scene.contacts else default_rivals()
-    if problem.scene.contacts and rivals:
-        raise ValueError("work_precision: the scene has contacts, through which diffrax would pass. Give rivals=().")
+        rivals = default_rivals() if problem.is_ode else ()
+    if rivals and not problem.is_ode:
+        raise ValueError(
+            "work_precision: the scene has contacts, through which diffrax would pass, or forces that remember, which it "
+            "would not let advance. Give rivals=()."
+        )
     if dts is not None:
         dts = np.atleast_1d(np.asarray(real_quantity("dts [s]", dts, above=0.0), float))
     with jax.enable_x64(True):
@@ -170,7 +173,7 @@ def _truth(problem: Problem) -> tuple[Particles, float, str]:
     times = _detailed(problem)
     if problem.exact is not None:
         return problem.exact(times), 0.0, "closed form"
-    if problem.scene.contacts:
+    if not problem.is_ode:
         return _fine_path(problem)
     size = _smallest_size(problem.scene)
     tolerance = {"rtol": 1e-13, "atol": 1e-13 * size}
@@ -309,12 +312,13 @@ def _depends_on_velocity(scene: Scene) -> bool:
 
 
 def _promised_order(method, velocity_dependent, scene):
-    """The order that a method promises for a scene; no more than 1 where touches are answered at the end of the step."""
+    """The order that a method promises for a scene; at most 1 where touches are answered, or springs part, after a step."""
     promises = getattr(method, "promises", None)
     if promises is None:
         return float("nan")
     order = float(promises.order_with_drag if velocity_dependent else promises.order)
-    return min(order, 1.0) if any(contact.response is contacts.project for contact in scene.contacts) else order
+    late = any(contact.response is contacts.project for contact in scene.contacts)
+    return min(order, 1.0) if late or any(hasattr(force, "advance") for force in scene.forces) else order
 
 
 class _Counter(NamedTuple):
