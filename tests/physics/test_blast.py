@@ -40,7 +40,7 @@ def test_half_of_it_arrives_at_the_reach_and_it_thins_as_a_wave_that_spreads():
 def test_a_blast_lasts_from_its_start_to_just_before_its_end():
     blast = forces.Blast((0.0, 0.0), 4.0, 2.0, at=0.25, duration=0.5)
     here = Particles(jnp.array([2.0, 0.0]), jnp.zeros(2))
-    seen = [float(blast(t, here, np.ones(()))[0]) for t in (0.0, np.nextafter(0.25, 0.0), 0.25, 0.5, 0.75, 9.0)]
+    seen = [float(blast(t, here, jnp.ones(()))[0]) for t in (0.0, np.nextafter(0.25, 0.0), 0.25, 0.5, 0.75, 9.0)]
     np.testing.assert_allclose(seen, [0, 0, 4, 4, 0, 0], rtol=1e-15)
     assert blast.discontinuities() == (0.25, 0.75)
 
