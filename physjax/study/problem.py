@@ -73,7 +73,8 @@ class Problem(NamedTuple):
     def verify(self) -> list[tuple[Truth, np.ndarray, bool]]:
         """Every truth with the measured value and whether it holds."""
         flight = self.reference()
-        measured = [np.asarray(truth.measure(flight)) for truth in self.truths]
+        with jax.enable_x64(True):
+            measured = [np.asarray(truth.measure(flight)) for truth in self.truths]
         return [
             (truth, value, bool(np.all(np.abs(value - truth.expected) <= truth.tolerance)))
             for truth, value in zip(self.truths, measured, strict=True)
