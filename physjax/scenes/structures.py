@@ -14,12 +14,16 @@ SPAN, HEIGHT, PANELS = 12.0, 2.0, 6
 
 
 @scene
-def jelly_cube(nodes: int = 4, side: float = 0.2, g: float = 9.8) -> Problem:
-    """A cube of jelly falls on its edge, bounces, turns over on to a face and trembles until it lies still."""
+def jelly_cube(nodes: int = 4, side: float = 0.2, lean: float = 0.0, g: float = 9.8) -> Problem:
+    """A cube of jelly falls flat on a smooth floor, bounces, and trembles until it lies still.
+
+    With a `lean` [rad] it falls on its edge and turns over, which no chart can follow: on which face it ends hangs on
+    the last digit.
+    """
     jelly = lattices.jelly(
-        (side,) * 3, (nodes,) * 3, mass=1.0, structural=300.0, shear=150.0, bend=75.0, damping=0.5, corner=(-side / 2,) * 3
-    )  # fmt: skip
-    lean, drop = np.deg2rad(30.0), 0.3
+        (side,) * 3, (nodes,) * 3, mass=1.0, structural=300.0, shear=150.0, damping=0.5, corner=(-side / 2,) * 3
+    )
+    drop = 0.3
     turn = np.array([[np.cos(lean), -np.sin(lean), 0.0], [np.sin(lean), np.cos(lean), 0.0], [0.0, 0.0, 1.0]])
     start = np.asarray(jelly.state.position) @ turn.T
     start[:, 1] += drop - start[:, 1].min()
@@ -28,9 +32,7 @@ def jelly_cube(nodes: int = 4, side: float = 0.2, g: float = 9.8) -> Problem:
         Particles(start, jnp.zeros_like(start)),
         mass=jelly.mass,
         forces=(forces.Gravity(g), jelly.springs),
-        contacts=(
-            contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0, coulomb=contacts.Coulomb(0.6, 0.5)),
-        ),
+        contacts=(contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0),),
     )
     touch = np.sqrt(2 * drop / g)
     share = np.asarray(jelly.mass)
@@ -55,6 +57,7 @@ def jelly_cube(nodes: int = 4, side: float = 0.2, g: float = 9.8) -> Problem:
         duration=3.0,
         truths=(
             Truth("falls as a whole, ½gt², until it touches [m]", fall, 0.0, 1e-12),
+            Truth("bounces: its middle rises again [m]", bounce, 0.1, 0.05),
             Truth(
                 "is squashed by the floor [part of its volume]",
                 lambda f: 1 - volume(f.position).min() / side**3,
@@ -89,7 +92,7 @@ def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) 
     weight = np.asarray(bridge.mass)[:, None] * np.array([0.0, -g])
     strain = lambda t: _strain(bridge, _equilibrium(bridge, weight + t * loaded))  # noqa: E731
     low, high = 0.0, 10.0
-    for _ in range(40):
+    for _ in range(30):
         t = 0.5 * (low + high)
         low, high = (t, high) if strain(t).max() < breaks_at else (low, t)
     weakest = int(np.argmax(strain(low)))
@@ -178,7 +181,7 @@ def _equilibrium(bridge, load):
     x, held = np.asarray(bridge.state.position, float).copy(), np.repeat(bridge.nodes["supports"], 2)
     (a, b), rest = bridge.springs.pairs.T, np.asarray(bridge.springs.rest_length, float)
     k = float(bridge.springs.stiffness)
-    for _ in range(20):
+    for _ in range(8):
         d = x[b] - x[a]
         length = np.linalg.norm(d, axis=1)
         way = d / length[:, None]

@@ -120,6 +120,7 @@ def work_precision(
         conserved=tuple(quantity.name for quantity in problem.conserved),
         dtype=np.dtype(dtype).name,
         path=(_detailed(problem), path.position),
+        scattered=_answers_late(problem.scene),
     )
 
 
@@ -295,7 +296,7 @@ def default_rivals() -> tuple:
 
 def _smallest_size(scene: Scene) -> float:
     """Typical size of the smaller of position and velocity: what an absolute tolerance is measured by."""
-    acceleration = np.asarray(scene.acceleration(jnp.zeros((), scene.state.dtype), scene.state))
+    acceleration = np.asarray(_acceleration(scene, scene.state))
     sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in (*scene.state, acceleration)]
     return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
 
@@ -304,21 +305,30 @@ def _depends_on_velocity(scene: Scene) -> bool:
     """Whether the forces look at the velocity: the promise of some methods depends on it."""
     with jax.enable_x64(True):
         scene = in_dtype(scene, jnp.float64)
-        t, (x, v) = jnp.zeros(()), scene.state
+        x, v = scene.state
         push = jnp.asarray(np.random.default_rng(0).normal(size=v.shape)) * (1 + jnp.abs(v))
-        return bool(
-            jnp.any(scene.acceleration(t, Particles(x, v + push)) != scene.acceleration(t, Particles(x, v - push)))
-        )
+        one, other = (_acceleration(scene, Particles(x, velocity)) for velocity in (v + push, v - push))
+        return bool(jnp.any(one != other))
+
+
+@jax.jit  # one compilation instead of one for each operation
+def _acceleration(scene: Scene, state: Particles) -> Any:
+    return scene.acceleration(jnp.zeros((), state.dtype), state)
 
 
 def _promised_order(method, velocity_dependent, scene):
-    """The order that a method promises for a scene; at most 1 where touches are answered, or springs part, after a step."""
+    """The order that a method promises for a scene; at most 1 where something is answered at the end of a step."""
     promises = getattr(method, "promises", None)
     if promises is None:
         return float("nan")
     order = float(promises.order_with_drag if velocity_dependent else promises.order)
+    return min(order, 1.0) if _answers_late(scene) else order
+
+
+def _answers_late(scene):
+    """Whether something that happens within a step is answered at its end: a touch that is projected, a spring that parts."""
     late = any(contact.response is contacts.project for contact in scene.contacts)
-    return min(order, 1.0) if late or any(hasattr(force, "advance") for force in scene.forces) else order
+    return late or any(hasattr(force, "advance") for force in scene.forces)
 
 
 class _Counter(NamedTuple):
