@@ -119,8 +119,7 @@ def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float
 def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) -> Problem:
     """A flag of 0.9 by 0.6 m on a pole, in a wind of 6 m/s that turns its fall into waves.
 
-    Air presses as |u·n| (u·n), which has a corner where a face turns from one side to the other, so that no method is
-    better than order 3 here.
+    Air presses as |u·n| (u·n), whose slope has a corner where a face turns its other side to the wind.
     """
     sheet = lattices.cloth(
         0.9, 0.6, rows, columns, mass=0.06, structural=100.0, shear=30.0, damping=0.02, corner=(0.0, 0.6, 0.0)
@@ -185,7 +184,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
             Truth("no node is in the ball [m]", into(0), 0.0, 1e-12),
             Truth("no node is under the floor [m]", into(1), 0.0, 1e-12),
             Truth(
-                "lies still at the end, but for a creep of at most g dt [m/s]",
+                "lies still at the end, but for a creep of at most g dt [g dt]",
                 lambda f: np.abs(f.velocity[-1]) / (g * f.dt),
                 0.0,
                 1.0,
@@ -197,7 +196,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
                 0.01,
             ),
         ),
-        frames=64,
+        frames=32,
     )
 
 

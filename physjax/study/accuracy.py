@@ -37,6 +37,9 @@ DETAIL = 12
 FINE, COARSER = 16, 11
 """Steps between two of those moments where rk4 must be the reference since diffrax cannot be, and to estimate its error."""
 
+LATE = 4
+"""Times as many where rk4 is of first order, since something is answered at the end of a step."""
+
 
 class Budget(NamedTuple):
     """How long a study may take: refine a step until one run costs `seconds`, time each run `repeats` times."""
@@ -190,10 +193,11 @@ def _fine_path(problem: Problem) -> tuple[Particles, float, str]:
     """The path by rk4 with fine steps; its error is estimated by longer ones, which end at other moments."""
     scene, frames = in_dtype(problem.scene, jnp.float64), problem.frames * DETAIL
     run = lambda count: sample(scene, as_module(rk4), problem.duration / (frames * count), count, frames=frames)  # noqa: E731
-    path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(count))) for count in (FINE, COARSER))
+    finer = LATE if _answers_late(scene) else 1
+    path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(finer * count))) for count in (FINE, COARSER))
     extent = np.abs(path.position - path.position[0]).max()
     floor = np.abs(path.position - coarser.position).max() / extent
-    return path, float(floor), f"own rk4, step {seconds_text(problem.duration / (frames * FINE))}"
+    return path, float(floor), f"own rk4, step {seconds_text(problem.duration / (frames * finer * FINE))}"
 
 
 def _detailed(problem: Problem) -> np.ndarray:

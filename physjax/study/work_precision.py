@@ -85,9 +85,11 @@ class WorkPrecision(NamedTuple):
             return float("inf") if self.floor <= EXACT else float("nan")
         scattered = self.scattered or method.endswith(PROJECTED)
         finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt or scattered]
-        if len(finest) < 3:
+        errors = [run.path_error for run in finest]
+        # what scatters says nothing unless it falls by much
+        if len(finest) < 3 or (scattered and max(errors) < 10 * min(errors)):
             return float("nan")
-        return float(np.polyfit(np.log([r.dt for r in finest]), np.log([r.path_error for r in finest]), 1)[0])
+        return float(np.polyfit(np.log([r.dt for r in finest]), np.log(errors), 1)[0])
 
     def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
         """The run with the least time whose path error stays below `error`; None if none does."""
