@@ -138,7 +138,7 @@ def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) ->
             Truth("stays on its pole [m]", lambda f: f.position[:, pole] - f.position[0, pole], 0.0, 0.0),
             Truth(
                 "no thread is stretched by more than a tenth [1]",
-                lambda f: np.maximum(f.scene.forces[1].strain(Particles(f.position, f.velocity)), 0.0),
+                lambda f: np.maximum(_strain(f.scene.forces[1], _states(f)), 0.0),
                 0.0,
                 0.1,
             ),
@@ -176,7 +176,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
         forces=(forces.Gravity(g), sheet.springs, forces.StokesDrag(6.0 * sheet.mass)),
         contacts=(ball, floor),
     )
-    into = lambda which: lambda f: np.minimum(f.scene.contacts[which].gap(0.0, f.position), 0.0)  # noqa: E731
+    into = lambda which: lambda f: np.minimum(_gap(f.scene.contacts[which], f.position), 0.0)  # noqa: E731
     return Problem(
         falling,
         duration=3.0,
@@ -206,12 +206,23 @@ def _carried(flight):
     return -np.sum(pull[np.asarray(flight.scene.pinned), 1])
 
 
+def _states(flight):
+    """All frames of a flight as one state."""
+    return Particles(flight.position, flight.velocity)
+
+
+# compiled once, instead of operation by operation
+_strain = jax.jit(lambda springs, states: springs.strain(states))
+_gap = jax.jit(lambda contact, position: contact.gap(0.0, position))
+_loads = jax.jit(jax.vmap(lambda scene, state: loads(scene, 0.0, state, per_term=True), (None, 0)))
+_energies = jax.jit(jax.vmap(lambda scene, state: total(scene, 0.0, state), (None, 0)))
+
+
 def _terms(flight, still=False):
     """The force of each term of the scene on each node at every frame [N]; of nodes that do not move, if so told."""
-    scene = flight.scene
-    state = Particles(flight.position, 0.0 * flight.velocity if still else flight.velocity)
-    terms = jax.jit(jax.vmap(lambda state: loads(scene, 0.0, state, per_term=True)))(state)
-    return [np.asarray(term) for term in terms]
+    states = _states(flight)
+    states = states._replace(velocity=0.0 * states.velocity) if still else states
+    return [np.asarray(term) for term in _loads(flight.scene, states)]
 
 
 def _momentum_gap(flight):
@@ -223,8 +234,7 @@ def _momentum_gap(flight):
 
 def _energy_gap(flight):
     """Change of energy from start to end, less the work of the air and of the springs' damping [J]."""
-    states = Particles(flight.position, flight.velocity)
-    energy = np.asarray(jax.jit(jax.vmap(lambda state: total(flight.scene, 0.0, state)))(states))
+    energy = np.asarray(_energies(flight.scene, _states(flight)))
     (_, pull, push), (_, elastic, _) = _terms(flight), _terms(flight, still=True)
     power = np.sum((push + pull - elastic) * flight.velocity, axis=(1, 2))
     return energy[-1] - energy[0] - _integral(flight.time, power)
