@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from physjax.physics import forces
+from physjax.pins import Pins
 from physjax.scene import Contact, Field, Force, Particles, Scene, loads
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
@@ -21,6 +22,7 @@ __all__ = [
     "Field",
     "Force",
     "Particles",
+    "Pins",
     "Scene",
     "Trajectory",
     "accuracy",

@@ -75,7 +75,7 @@ def _study(name: str, folder: Path, quick: bool):
 
     with jax.enable_x64(True):
         problem = SCENES[name]()
-    rivals = () if problem.scene.contacts else accuracy.default_rivals()
+    rivals = accuracy.default_rivals() if problem.is_ode else ()
     with tqdm(total=1 + len(METHODS) + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
 
         def progress(what: str) -> None:

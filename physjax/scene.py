@@ -160,19 +160,19 @@ class Function(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """Everything a run needs but the method: state, mass [kg], forces, contacts, and a mask of the lanes that are held.
+    """Everything a run needs but the method: state, mass [kg], forces, contacts, and which lanes are held or led.
 
     `mass` is a scalar or per lane. `forces` are library forces or any callable `(t, state, mass) -> newtons`. `pinned`
-    is a boolean mask over the lanes. Every number becomes an array of the state's dtype: changing it compiles nothing,
-    and it can be swept and differentiated. Raises ValueError or TypeError for shapes that do not match, numbers that
-    are not finite, and masses <= 0.
+    is a boolean mask over the lanes that are held, or `Pins(nodes, path)`, which leads them. Every number becomes an
+    array of the state's dtype: changing it compiles nothing, and it can be swept and differentiated. Raises ValueError
+    or TypeError for shapes that do not match, numbers that are not finite, and masses <= 0.
     """
 
     state: Particles
     mass: Float[Array, "..."]
     forces: tuple
     contacts: tuple
-    pinned: Bool[Array, "*lanes"] | None
+    pinned: Bool[Array, "*lanes"] | eqx.Module | None
     reaction: Callable | None = eqx.field(init=False)
 
     def __init__(
@@ -192,7 +192,10 @@ class Scene(eqx.Module):
         mass = real_quantity("mass [kg]", mass, above=0.0).astype(dtype)
         if mass.shape not in ((), lanes):
             raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {lanes}.")
-        if pinned is not None:
+        if hasattr(pinned, "lead"):
+            pinned = pinned.prepared(state)
+            state = pinned.lead(0.0, state)
+        elif pinned is not None:
             pinned = jnp.asarray(pinned)
             if pinned.dtype != bool or pinned.shape != lanes:
                 raise ValueError(
@@ -215,13 +218,25 @@ class Scene(eqx.Module):
         return any(getattr(force, "couples", True) for force in self.forces)
 
     @property
+    def held(self) -> Bool[Array, "*lanes"] | None:
+        """Mask of the lanes that no force moves, held where they are or led along a path; None where there are none."""
+        return self.pinned if self.led is None else self.led.nodes
+
+    @property
+    def led(self) -> Any:
+        """The `Pins` that lead lanes along a path; None without."""
+        return self.pinned if hasattr(self.pinned, "lead") else None
+
+    @property
     def status_shape(self) -> tuple[int, ...]:
         """Shape of what is decided once a scene when lanes are coupled, once a lane when not: status and step size."""
         return self.state.lanes[:-1] if self.couples else self.state.lanes
 
     def acceleration(self, t: ArrayLike, state: Particles) -> Float[Array, "*lanes dim"]:
-        """Newton's second law, a = ΣF/m [m/s²]; held lanes do not accelerate."""
-        free = None if self.pinned is None else 1 - self.pinned.astype(state.dtype)
+        """Newton's second law, a = ΣF/m [m/s²]; held lanes do not accelerate, led ones as their path does."""
+        if self.led is not None:
+            state = self.led.lead(t, state)
+        free = None if self.held is None else 1 - self.held.astype(state.dtype)
         fields = [_shaped(f, f.acceleration(t, state, self.mass), state) for f in self.forces if isinstance(f, Field)]
         newtons = [_shaped(f, f(t, state, self.mass), state) for f in self.forces if not isinstance(f, Field)]
         total = []
@@ -230,6 +245,8 @@ class Scene(eqx.Module):
         if newtons:
             total.append(scale((1.0 if free is None else free) / self.mass, _sum(newtons)))
         acceleration = _sum(total) if total else jnp.zeros_like(state.velocity)
+        if self.led is not None:
+            acceleration = self.led.drive(t, state, acceleration)
         return acceleration if self.reaction is None else self.reaction(t, state, acceleration)
 
     def rate(self, t: ArrayLike, state: Particles) -> Particles:
@@ -258,7 +275,9 @@ class Scene(eqx.Module):
             motion = partial(response, motion)
         after = motion(self, t, dt)
         state = after.state
-        if self.contacts and self.pinned is not None:
+        if self.led is not None:
+            state = self.led.lead(t + dt, state)
+        elif self.contacts and self.pinned is not None:
             held = self.pinned[..., None]
             state = jax.tree.map(lambda now, before: jnp.where(held, before, now), state, self.state)
         return after.having(state=state).advanced(t, dt)

@@ -24,7 +24,7 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FIL
 FLOORS = (
     {"vectors", "checks", "files", "lanes"},
     {"scene"},
-    {"trajectory"},
+    {"trajectory", "pins"},
     {"physics", "stepping"},
     {"show"},
     {"study"},

@@ -19,6 +19,7 @@ from physjax.vectors import dot, norm, over, scale, spin, unit, upward
 
 __all__ = [
     "Anchor",
+    "Blast",
     "Buoyancy",
     "Constant",
     "Gravitation",
@@ -89,6 +90,52 @@ class Kick(Force):
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
         """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole kick."""
         return self.at, self.at + self.duration
+
+
+class Blast(Force):
+    """An explosion: away from the `center`, impulse J/(1 + (d/r)²) [N s] at the distance d, spread over a `duration` [s].
+
+    Half of J arrives at the `reach` r [m], and far out it thins as 1/d², like a wave that spreads. `impulse` J is a number
+    or one per lane (a plate that shows more of its face gets more); what stands in the center itself stays. The force
+    follows a lane that moves while it lasts. As with `Kick`, a step feels its mean in time.
+    """
+
+    center: Float[Array, "..."] = quantity("center of the blast", "m")
+    impulse: Float[Array, "..."] = quantity("impulse", "N s")
+    reach: Float[Array, "..."] = quantity("reach of the blast", "m", above=0)
+    at: Float[Array, "..."] = quantity("start of the blast", "s")
+    duration: Float[Array, "..."] = quantity("duration of the blast", "s", above=0)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """J/(1 + (d/r)²)/duration away from the center while the blast lasts [N]."""
+        t = _per_lane(t, state)
+        lasts = (self.at <= t) & (t < self.at + self.duration)
+        return scale(jnp.where(lasts, 1 / self.duration, 0.0), self.received(state))
+
+    def received(self, state: Particles) -> Float[Array, "*lanes dim"]:
+        """The impulse that each lane gets if it stays where it is [N s]."""
+        d = state.position - over(self.center, state.position)
+        return scale(self.impulse / (1 + dot(d, d) / self.reach**2), unit(d))
+
+    def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> "_SteadyBlast":
+        """The mean in time of the force over the step from t to t + dt."""
+        t, dt = _per_lane(t, state), _per_lane(dt, state)
+        share = _share_before(self.at + self.duration, t, dt) - _share_before(self.at, t, dt)
+        return _SteadyBlast(self, share / self.duration)
+
+    def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
+        """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole blast."""
+        return self.at, self.at + self.duration
+
+
+class _SteadyBlast(Force):
+    """A blast that lasts: so many of its impulses a second."""
+
+    blast: Blast
+    rate: Float[Array, "..."]
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        return scale(self.rate, self.blast.received(state))
 
 
 class StokesDrag(Force):

@@ -34,11 +34,11 @@ class Blocks(NamedTuple):
     def of(cls, scene: Scene, moving: Any, frame_steps: int) -> "Blocks | None":
         """The blocks for a scene, or None where they would not pay or could change its meaning.
 
-        Lanes that are coupled stay together, and so do those of a plain function, which may hold arrays that cannot be
-        cut, and those that share something that changes: `moving` are the arrays that a step changes.
+        Lanes that are coupled stay together, and so do those of a plain function or a path, which may hold arrays that
+        cannot be cut, and those that share something that changes: `moving` are the arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)
-        whole = scene.couples or any(isinstance(force, Function) for force in scene.forces)
+        whole = scene.couples or scene.led is not None or any(isinstance(force, Function) for force in scene.forces)
         if whole or total < SMALLEST or frame_steps < FEWEST_STEPS or jax.default_backend() != "cpu":
             return None
         count = math.ceil(total / BLOCK)

@@ -146,7 +146,8 @@ def solve_ode(
         max_steps=MAX_STEPS if strict else MAX_STEPS // 10,
         throw=False,
     )
-    return solution.ys, solution.result == diffrax.RESULTS.successful, solution.stats
+    states = solution.ys if scene.led is None else jax.vmap(scene.led.lead)(times, solution.ys)
+    return states, solution.result == diffrax.RESULTS.successful, solution.stats
 
 
 def _largest(state: Particles) -> Array:

@@ -133,7 +133,8 @@ def _is_mostly_compiled(scene: Scene) -> bool:
 def _stands_alone(run: tuple) -> bool:
     """Whether a run on a CPU is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
     scene, method, *_ = run
-    parts = (*scene.forces, *scene.contacts, method)
+    path = () if scene.led is None else (scene.led.path,)
+    parts = (*scene.forces, *scene.contacts, *path, method)
     ours = all(_is_ours(part.function if isinstance(part, Function) else type(part)) for part in parts)
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
     return ours and not traced and jax.default_backend() == "cpu"

@@ -35,7 +35,10 @@ DETAIL = 12
 """Moments of the reference path for every one at which errors are measured."""
 
 FINE, COARSER = 16, 11
-"""Steps between two of those moments where rk4 must be the reference because there are contacts, and to estimate its error."""
+"""Steps between two of those moments where rk4 must be the reference since diffrax cannot be, and to estimate its error."""
+
+LATE = 4
+"""Times as many where rk4 is of first order, since something is answered at the end of a step."""
 
 
 class Budget(NamedTuple):
@@ -72,19 +75,22 @@ def work_precision(
     `problem` is a gallery problem, or a scene with its `duration` [s] and, if known, its closed form `exact(times)`.
     `methods`: all of the registry by default. `dts` [s]: from coarse to fine within the budget by default; each is
     rounded so that a whole number of steps fits between the moments compared. `rivals`: diffrax solvers, run adaptively
-    at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts. The truth is the closed form
-    where there is one, else diffrax's Dopri8 at 1e-13, or our own rk4 with fine steps where there are contacts; its own
-    error is the floor of the result. Where impacts are timed (`contacts.impact`), every method runs once more with
-    `contacts.project`, the lecture's answer at the end of the step, as "rk4, projected": what that does to the order.
-    Compiles once per method and treatment. `progress(what)` is called before each method. Raises ValueError for a
-    missing duration or bad steps.
+    at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts or forces that remember. The
+    truth is the closed form where there is one, else diffrax's Dopri8 at 1e-13, or, where diffrax has no rivals either,
+    our own rk4 with fine steps; its own error is the floor of the result. Where impacts are timed (`contacts.impact`),
+    every method runs once more with `contacts.project`, the lecture's answer at the end of the step, as "rk4,
+    projected": what that does to the order. Compiles once per method and treatment. `progress(what)` is called before
+    each method. Raises ValueError for a missing duration or bad steps.
     """
     problem = _as_problem(problem, duration, exact, conserved)
     methods = list(METHODS.values()) if methods is None else list(methods)
     if rivals is None:
-        rivals = () if problem.scene.contacts else default_rivals()
-    if problem.scene.contacts and rivals:
-        raise ValueError("work_precision: the scene has contacts, through which diffrax would pass. Give rivals=().")
+        rivals = default_rivals() if problem.is_ode else ()
+    if rivals and not problem.is_ode:
+        raise ValueError(
+            "work_precision: the scene has contacts, through which diffrax would pass, or forces that remember, which it "
+            "would not let advance. Give rivals=()."
+        )
     if dts is not None:
         dts = np.atleast_1d(np.asarray(real_quantity("dts [s]", dts, above=0.0), float))
     with jax.enable_x64(True):
@@ -117,6 +123,7 @@ def work_precision(
         conserved=tuple(quantity.name for quantity in problem.conserved),
         dtype=np.dtype(dtype).name,
         path=(_detailed(problem), path.position),
+        scattered=_answers_late(problem.scene),
     )
 
 
@@ -170,7 +177,7 @@ def _truth(problem: Problem) -> tuple[Particles, float, str]:
     times = _detailed(problem)
     if problem.exact is not None:
         return problem.exact(times), 0.0, "closed form"
-    if problem.scene.contacts:
+    if not problem.is_ode:
         return _fine_path(problem)
     size = _smallest_size(problem.scene)
     tolerance = {"rtol": 1e-13, "atol": 1e-13 * size}
@@ -186,10 +193,11 @@ def _fine_path(problem: Problem) -> tuple[Particles, float, str]:
     """The path by rk4 with fine steps; its error is estimated by longer ones, which end at other moments."""
     scene, frames = in_dtype(problem.scene, jnp.float64), problem.frames * DETAIL
     run = lambda count: sample(scene, as_module(rk4), problem.duration / (frames * count), count, frames=frames)  # noqa: E731
-    path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(count))) for count in (FINE, COARSER))
+    finer = LATE if _answers_late(scene) else 1
+    path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(finer * count))) for count in (FINE, COARSER))
     extent = np.abs(path.position - path.position[0]).max()
     floor = np.abs(path.position - coarser.position).max() / extent
-    return path, float(floor), f"own rk4, step {seconds_text(problem.duration / (frames * FINE))}"
+    return path, float(floor), f"own rk4, step {seconds_text(problem.duration / (frames * finer * FINE))}"
 
 
 def _detailed(problem: Problem) -> np.ndarray:
@@ -292,7 +300,7 @@ def default_rivals() -> tuple:
 
 def _smallest_size(scene: Scene) -> float:
     """Typical size of the smaller of position and velocity: what an absolute tolerance is measured by."""
-    acceleration = np.asarray(scene.acceleration(jnp.zeros((), scene.state.dtype), scene.state))
+    acceleration = np.asarray(_acceleration(scene, scene.state))
     sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in (*scene.state, acceleration)]
     return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
 
@@ -301,20 +309,30 @@ def _depends_on_velocity(scene: Scene) -> bool:
     """Whether the forces look at the velocity: the promise of some methods depends on it."""
     with jax.enable_x64(True):
         scene = in_dtype(scene, jnp.float64)
-        t, (x, v) = jnp.zeros(()), scene.state
+        x, v = scene.state
         push = jnp.asarray(np.random.default_rng(0).normal(size=v.shape)) * (1 + jnp.abs(v))
-        return bool(
-            jnp.any(scene.acceleration(t, Particles(x, v + push)) != scene.acceleration(t, Particles(x, v - push)))
-        )
+        one, other = (_acceleration(scene, Particles(x, velocity)) for velocity in (v + push, v - push))
+        return bool(jnp.any(one != other))
+
+
+@jax.jit  # one compilation instead of one for each operation
+def _acceleration(scene: Scene, state: Particles) -> Any:
+    return scene.acceleration(jnp.zeros((), state.dtype), state)
 
 
 def _promised_order(method, velocity_dependent, scene):
-    """The order that a method promises for a scene; no more than 1 where touches are answered at the end of the step."""
+    """The order that a method promises for a scene; at most 1 where something is answered at the end of a step."""
     promises = getattr(method, "promises", None)
     if promises is None:
         return float("nan")
     order = float(promises.order_with_drag if velocity_dependent else promises.order)
-    return min(order, 1.0) if any(contact.response is contacts.project for contact in scene.contacts) else order
+    return min(order, 1.0) if _answers_late(scene) else order
+
+
+def _answers_late(scene):
+    """Whether something that happens within a step is answered at its end: a touch that is projected, a spring that parts."""
+    late = any(contact.response is contacts.project for contact in scene.contacts)
+    return late or any(hasattr(force, "advance") for force in scene.forces)
 
 
 class _Counter(NamedTuple):

@@ -16,6 +16,10 @@ ERRORS = (1e-2, 1e-4, 1e-6)
 """Errors (relative to the extent of the path) for which the fastest method is named."""
 
 
+EXACT = 1e-10
+"""A truth whose own error is larger than this cannot say of a run that it is exact."""
+
+
 class Run(NamedTuple):
     """One run of one method. Errors are relative to the extent of the path; `drifts` to the size of the conserved quantity.
 
@@ -44,7 +48,10 @@ class Run(NamedTuple):
 
 
 class WorkPrecision(NamedTuple):
-    """All runs of a scene under its methods and rivals, their truth, and that truth's own error (`floor`)."""
+    """All runs of a scene under its methods and rivals, their truth, and that truth's own error (`floor`).
+
+    `scattered`: touches are answered, or springs part, at the end of a step, under every method.
+    """
 
     name: str
     runs: tuple[Run, ...]
@@ -55,6 +62,7 @@ class WorkPrecision(NamedTuple):
     conserved: tuple[str, ...]
     dtype: str
     path: tuple[np.ndarray, np.ndarray]
+    scattered: bool = False
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -68,17 +76,20 @@ class WorkPrecision(NamedTuple):
     def observed_order(self, method: str) -> float:
         """Slope of log error against log dt over the finest runs above rounding; inf if all is rounding, NaN if unknown.
 
-        Over all runs above rounding where contacts are projected: those errors scatter with where in a step a bounce
-        happens to fall.
+        Over all runs above rounding where contacts are projected or springs part: those errors scatter with where in a
+        step it happens to fall. The truth's own error counts as rounding, but tells of no run that it is exact.
         """
         runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
         resolved = [run for run in runs if self._rounding(run) < run.path_error < 0.05]
         if runs and all(run.path_error <= self._rounding(run) for run in runs):
-            return float("inf")
-        finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt or method.endswith(PROJECTED)]
-        if len(finest) < 3:
+            return float("inf") if self.floor <= EXACT else float("nan")
+        scattered = self.scattered or method.endswith(PROJECTED)
+        finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt or scattered]
+        errors = [run.path_error for run in finest]
+        # what scatters says nothing unless it falls by much
+        if len(finest) < 3 or (scattered and max(errors) < 10 * min(errors)):
             return float("nan")
-        return float(np.polyfit(np.log([r.dt for r in finest]), np.log([r.path_error for r in finest]), 1)[0])
+        return float(np.polyfit(np.log([r.dt for r in finest]), np.log(errors), 1)[0])
 
     def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
         """The run with the least time whose path error stays below `error`; None if none does."""

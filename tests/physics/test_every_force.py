@@ -26,6 +26,9 @@ CASES = {
     "Gravity along z": Case(lambda **n: forces.Gravity(**n, up=2), {"g": 9.8}, {}, 3),
     "Constant": Case(forces.Constant, {}, {"force": [3.0, -1.0]}, 2),
     "Kick": Case(forces.Kick, {"at": 0.3, "duration": 0.4}, {"impulse": [2.0, 1.0]}, 2),
+    "Blast": Case(
+        forces.Blast, {"impulse": 2.0, "reach": 0.7, "at": 0.3, "duration": 0.4}, {"center": [0.1, 0.2, -0.3]}, 3
+    ),
     "StokesDrag": Case(forces.StokesDrag, {"coefficient": 0.3}, WIND, 3),
     "StokesDrag in still air": Case(forces.StokesDrag, {"coefficient": 0.3}, {}, 2),
     "QuadraticDrag": Case(forces.QuadraticDrag, {"area": 0.1, "coefficient": 0.4, "density": 1.2}, WIND, 3),

@@ -221,7 +221,8 @@ def test_every_normal_mode_of_a_chain_has_its_frequency():
 # derivatives
 
 
-def test_gradients_of_a_run_are_those_of_its_differences():
+@LAYOUTS
+def test_gradients_of_a_run_are_those_of_its_differences(layout):
     pairs = grid(4, 4)
     nodes = np.arange(16)
     x = np.stack([0.1 * (nodes % 4), 0.02 * np.sin(nodes), 0.1 * (nodes // 4)], axis=-1)
@@ -230,7 +231,7 @@ def test_gradients_of_a_run_are_those_of_its_differences():
 
     @jax.jit
     def outcome(k, L, c, x):
-        springs = Springs(pairs, k, L, c)
+        springs = Springs(pairs, k, L, c, layout=layout)
         scene = Scene(Particles(x, jnp.zeros_like(x)), 0.01, (forces.Gravity(g=G), springs), pinned=nodes < 2)
         run = simulate(scene, methods.semi_implicit_euler, dt=1e-3, steps=200, save_every=200)
         return jnp.sum(weights * run.final_scene.state.position)

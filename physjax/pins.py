@@ -1,0 +1,126 @@
+"""Lanes that no force moves because something else does: a hand that shakes a flag, the limb that drags a body."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from physjax.checks import concrete
+from physjax.scene import Particles, as_module
+from physjax.vectors import components, stacked
+
+
+class Pins(eqx.Module):
+    """Led lanes: `Scene(..., pinned=Pins(nodes, path))` moves the lanes of the mask `nodes` along `path(t)`.
+
+    `path(t) -> positions` [m] of all lanes, `(*lanes, dim)` or broadcastable to it; only the rows of led lanes count.
+    Forces feel them where the path is at the moment they are asked, with the velocity of the path (its derivative), so
+    that a method keeps its order where the path is smooth; after each step they stand on it exactly. `t` [s] is a
+    scalar, or shaped to broadcast with the lanes where a run has many step sizes. Numbers of a path that is an
+    `equinox.Module` can be swept and differentiated; a plain function compiles anew for each new one. Led lanes must
+    start on the path: `state = pins.lead(0.0, state)`. Raises ValueError or TypeError otherwise.
+    """
+
+    nodes: Bool[Array, "*lanes"]
+    path: Callable
+
+    def __init__(self, nodes: Any, path: Any):
+        nodes = jnp.asarray(nodes)
+        if nodes.dtype != bool:
+            raise ValueError(f"Pins: got nodes of dtype {nodes.dtype}, expected booleans, one for each lane.")
+        if not callable(path) or isinstance(path, type):
+            raise TypeError(
+                f"Pins: got the path {path!r}, expected a function t -> positions. To hold lanes where they are, give "
+                "the mask alone: pinned=nodes."
+            )
+        self.nodes = nodes
+        self.path = as_module(path)
+
+    def lead(self, t: ArrayLike, state: Particles) -> Particles:
+        """The state with the led lanes where the path is at the time t [s], and as fast."""
+        position, velocity = self._motion(t, state)
+        position, velocity = self._on_led(position, state.position), self._on_led(velocity, state.velocity)
+        # kept apart: XLA on CPU would follow the path again for every neighbour that looks at a lane
+        return state._replace(**lax.optimization_barrier({"position": position, "velocity": velocity}))
+
+    def drive(
+        self, t: ArrayLike, state: Particles, acceleration: Float[Array, "*lanes dim"]
+    ) -> Float[Array, "*lanes dim"]:
+        """The accelerations [m/s²] with that of the path, its second derivative, where lanes are led."""
+        t = self._clock(t, state)
+        _, bend = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
+        return self._on_led(bend, acceleration)
+
+    def prepared(self, state: Particles) -> "Pins":
+        """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
+        if self.nodes.shape != state.lanes:
+            raise ValueError(
+                f"Pins: got nodes of shape {self.nodes.shape}, expected booleans of the lanes' shape {state.lanes}."
+            )
+        cast = lambda leaf: leaf.astype(state.dtype) if eqx.is_inexact_array(leaf) else leaf  # noqa: E731
+        pins = jax.tree.map(cast, self)
+        _demand_start(pins, state)
+        return pins
+
+    def _clock(self, t: ArrayLike, state: Particles) -> Array:
+        """The time in the state's dtype, with axes for the lanes of each scene where scenes have times of their own."""
+        t = jnp.asarray(t, state.dtype)
+        return t.reshape(t.shape + (1,) * (len(state.lanes) - t.ndim)) if t.ndim else t
+
+    def _motion(self, t: ArrayLike, state: Particles) -> tuple[Array, Array]:
+        """Position [m] and velocity [m/s] of the path, for all lanes."""
+        t, shape = self._clock(t, state), state.position.shape
+
+        def positions(t):
+            value = jnp.asarray(self.path(t))
+            if not jnp.issubdtype(value.dtype, jnp.number) or not _fits(value.shape, shape):
+                raise ValueError(
+                    f"Pins: the path returns {value.dtype} of shape {value.shape} for a time of shape {t.shape}, expected "
+                    f"positions [m] of the shape {shape} or broadcastable to it: (*lanes, dim), as the state has."
+                )
+            return value.astype(state.dtype)
+
+        position, velocity = jax.jvp(positions, (t,), (jnp.ones_like(t),))
+        return jnp.broadcast_to(position, shape), jnp.broadcast_to(velocity, shape)
+
+    def _on_led(self, led: Array, free: Array) -> Array:
+        # by components: a choice between whole vectors takes half as long again
+        pairs = zip(components(led), components(free), strict=True)
+        return stacked([jnp.where(self.nodes, a, b) for a, b in pairs])
+
+
+def _fits(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
+    """Whether an array of one shape can be broadcast to another."""
+    pairs = zip(shape[::-1], whole[::-1], strict=False)
+    return len(shape) <= len(whole) and all(n in (1, wanted) for n, wanted in pairs)
+
+
+def _demand_start(pins: Pins, state: Particles) -> None:
+    """Raise a ValueError unless the path is finite at t = 0 and the led lanes start on it, but for rounding."""
+    position, velocity = pins._motion(0.0, state)
+    nodes, x = concrete(pins.nodes), concrete(state.position)
+    position, velocity = concrete(position), concrete(velocity)
+    if nodes is None or position is None or velocity is None:
+        return
+    where = np.argwhere(nodes)
+    for name, value in (("path(0) [m]", position), ("velocity of the path at t = 0 [m/s]", velocity)):
+        bad = ~np.isfinite(value[nodes]).all(axis=-1)
+        if bad.any():
+            raise ValueError(
+                f"Pins: {name} is {value[nodes][bad][0]} at lane {where[bad][0].tolist()}, expected finite numbers."
+            )
+    if x is None:
+        return
+    off = np.abs(x - position)[nodes].max(axis=-1, initial=0.0)
+    far = off > 16 * float(jnp.finfo(state.dtype).eps) * max(np.abs(x).max(), np.abs(position[nodes]).max(initial=0.0))
+    if far.any():
+        raise ValueError(
+            f"Pins: {far.sum()} of {far.size} led lanes do not start on the path: lane {where[far][0].tolist()} is at "
+            f"{x[nodes][far][0]}, path(0) is {position[nodes][far][0]} [m]. Start there: state = pins.lead(0.0, state)."
+        )

@@ -1,0 +1,245 @@
+"""Rope and cloth: they hang, fly, and lie over things."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from physjax.physics import contacts, forces, lattices
+from physjax.scene import Particles, Scene, loads
+from physjax.scenes.gallery import scene
+from physjax.study.energy import total
+from physjax.study.problem import Problem, Truth
+
+
+@scene
+def hanging_rope(
+    nodes: int = 25, span: float = 1.0, length: float = 1.3, stiffness: float = 1e4, mass: float = 1.0, g: float = 9.8
+) -> Problem:
+    """A rope between two nails, let go with a corner in it, that comes to rest in the air: an elastic catenary.
+
+    The air's drag is what brings it to rest; the rope itself has no friction.
+    """
+    rope = lattices.rope((-span / 2, 0.0), (span / 2, 0.0), nodes, mass=mass, stiffness=stiffness, length=length)
+    along = np.linspace(0.0, length, nodes)
+    # pulled tight into a corner, off the middle
+    left, right = 0.65 * length, 0.35 * length
+    corner = (left**2 - right**2) / (2 * span)
+    deep = -np.sqrt(left**2 - (corner + span / 2) ** 2)
+    shape = np.stack(
+        [
+            np.interp(along, (0, left, length), (-span / 2, corner, span / 2)),
+            np.interp(along, (0, left, length), (0, deep, 0)),
+        ],
+        axis=-1,
+    )
+    start = jnp.asarray(shape)
+    hanging = Scene(
+        Particles(start, jnp.zeros_like(start)),
+        mass=rope.mass,
+        forces=(forces.Gravity(g), rope.springs, forces.StokesDrag(10.0 * rope.mass)),
+        pinned=rope.nodes["ends"],
+    )
+    curve = elastic_catenary(along, span, mass * g, stiffness * length / (nodes - 1))
+    return Problem(
+        hanging,
+        duration=4.0,
+        truths=(
+            Truth(
+                "comes to rest in a catenary [length of the rope]",
+                lambda f: (f.position[-1] - curve) / length,
+                0.0,
+                1e-3,
+            ),
+            Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-6),
+            Truth(
+                "the nails carry its weight, but for the shares that rest on them [N]",
+                _carried,
+                mass * g * (nodes - 2) / (nodes - 1),
+                1e-6,
+            ),
+        ),
+    )
+
+
+def elastic_catenary(along: np.ndarray, span: float, weight: float, stiffness: float) -> np.ndarray:
+    """Points of a rope that hangs between (±span/2, 0) [m], at the distances `along` it when it is slack, `(points, 2)`.
+
+    `weight` W [N], `stiffness` EA [N]: force for each unit of strain. H. M. Irvine, Cable Structures, 1981, section 2.3:
+    with s from one end, H the horizontal pull and V = W/2,
+    x = Hs/EA + (HL/W)(asinh(V/H) - asinh((V - Ws/L)/H)), y = -(Ws/EA)(V/W - s/2L) - (HL/W)(√(1 + V²/H²) - √(1 + (V - Ws/L)²/H²)).
+    """
+    length, rise = along[-1], weight / 2 - weight * along / along[-1]
+
+    def points(pull):
+        x = pull * along / stiffness + pull * length / weight * (np.arcsinh(rise[0] / pull) - np.arcsinh(rise / pull))
+        sag = weight * along / stiffness * (0.5 - along / (2 * length))
+        sag = sag + pull * length / weight * (np.hypot(1, rise[0] / pull) - np.hypot(1, rise / pull))
+        return np.stack([x - span / 2, -sag], axis=-1)
+
+    low, high = 1e-6 * weight, 1e6 * weight
+    for _ in range(200):  # the span grows with the pull
+        pull = np.sqrt(low * high)
+        low, high = (pull, high) if points(pull)[-1, 0] < span / 2 else (low, pull)
+    return points(pull)
+
+
+@scene
+def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float = 9.8) -> Problem:
+    """A cloth on two nails, let go from the level: it swings down, folds and hangs still."""
+    sheet = lattices.cloth(
+        side, side, nodes, nodes, mass=mass, structural=50.0, shear=20.0, bend=5.0, damping=0.05,
+        corner=(-side / 2, 0.0, 0.0), down=(0.0, 0.0, 1.0),
+    )  # fmt: skip
+    nails = sheet.nodes["top"] & sheet.nodes["corners"]
+    hanging = Scene(
+        sheet.state,
+        mass=sheet.mass,
+        forces=(forces.Gravity(g), sheet.springs, forces.StokesDrag(8.0 * sheet.mass)),
+        pinned=nails,
+    )
+    weight = g * float(np.sum(sheet.mass[~nails]))
+    mirrored = np.arange(nodes**2).reshape(nodes, nodes)[:, ::-1].ravel()
+    return Problem(
+        hanging,
+        duration=5.0,
+        truths=(
+            Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 2e-6),
+            Truth("the nails carry the weight of the rest [N]", _carried, weight, 1e-6),
+            Truth(
+                "left and right mirror each other [m]",
+                lambda f: f.position - f.position[:, mirrored] * [-1.0, 1.0, 1.0],
+                0.0,
+                1e-9,
+            ),
+        ),
+    )
+
+
+@scene
+def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) -> Problem:
+    """A flag of 0.9 by 0.6 m on a pole, in a wind of 6 m/s that turns its fall into waves.
+
+    Air presses as |u·n| (u·n), whose slope has a corner where a face turns its other side to the wind.
+    """
+    sheet = lattices.cloth(
+        0.9, 0.6, rows, columns, mass=0.06, structural=100.0, shear=30.0, damping=0.02, corner=(0.0, 0.6, 0.0)
+    )
+    flying = Scene(
+        sheet.state,
+        mass=sheet.mass,
+        forces=(forces.Gravity(g), sheet.springs, sheet.wind((speed, 0.0, 0.1 * speed))),
+        pinned=sheet.nodes["left"],
+    )
+    pole = sheet.nodes["left"]
+    return Problem(
+        flying,
+        duration=1.0,
+        truths=(
+            Truth("stays on its pole [m]", lambda f: f.position[:, pole] - f.position[0, pole], 0.0, 0.0),
+            Truth(
+                "no thread is stretched by more than a tenth [1]",
+                lambda f: np.maximum(_strain(f.scene.forces[1], _states(f)), 0.0),
+                0.0,
+                0.1,
+            ),
+            Truth("momentum is what air, weight and pole gave [kg m/s]", _momentum_gap, 0.0, 2e-3),
+            Truth("energy is what the air gave, less what the threads lost [J]", _energy_gap, 0.0, 1e-3),
+            Truth(
+                "flies downwind: the free edge is far from the pole [m]",
+                lambda f: f.position[-1, sheet.nodes["right"], 0].mean(),
+                0.9,
+                0.2,
+            ),
+        ),
+        frames=128,
+    )
+
+
+@scene
+def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, g: float = 9.8) -> Problem:
+    """A cloth falls on a ball on the floor, slips a little, and comes to rest over it, with two folds.
+
+    Nodes touch, not the faces between them: the ball and the floor that are seen are a centimetre smaller and deeper.
+    Touches are answered at the end of a step, where friction takes the velocity, but not the way ½a dt² that was gone
+    within it: what lies on a slope creeps at up to g dt.
+    """
+    sheet = lattices.cloth(
+        side, side, nodes, nodes, mass=0.15, structural=50.0, shear=20.0, bend=10.0, damping=0.1,
+        corner=(0.05 - side / 2, 2 * radius + 0.05, 0.03 - side / 2), down=(0.0, 0.0, 1.0),
+    )  # fmt: skip
+    grip = contacts.Coulomb(0.5, 0.4)
+    ball = contacts.Sphere((0.0, radius, 0.0), radius, restitution=0.0, coulomb=grip)
+    floor = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0, coulomb=grip)
+    falling = Scene(
+        sheet.state,
+        mass=sheet.mass,
+        forces=(forces.Gravity(g), sheet.springs, forces.StokesDrag(6.0 * sheet.mass)),
+        contacts=(ball, floor),
+    )
+    into = lambda which: lambda f: np.minimum(_gap(f.scene.contacts[which], f.position), 0.0)  # noqa: E731
+    return Problem(
+        falling,
+        duration=3.0,
+        truths=(
+            Truth("no node is in the ball [m]", into(0), 0.0, 1e-12),
+            Truth("no node is under the floor [m]", into(1), 0.0, 1e-12),
+            Truth(
+                "lies still at the end, but for a creep of at most g dt [g dt]",
+                lambda f: np.abs(f.velocity[-1]) / (g * f.dt),
+                0.0,
+                1.0,
+            ),
+            Truth(
+                "lies on the ball: its highest node is on top [m]",
+                lambda f: f.position[-1, :, 1].max(),
+                2 * radius,
+                0.01,
+            ),
+        ),
+        frames=32,
+    )
+
+
+def _carried(flight):
+    """Vertical force of the springs on what is pinned, at the end [N], downwards positive."""
+    pull = _terms(flight)[1][-1]
+    return -np.sum(pull[np.asarray(flight.scene.pinned), 1])
+
+
+def _states(flight):
+    """All frames of a flight as one state."""
+    return Particles(flight.position, flight.velocity)
+
+
+# compiled once, instead of operation by operation
+_strain = jax.jit(lambda springs, states: springs.strain(states))
+_gap = jax.jit(lambda contact, position: contact.gap(0.0, position))
+_loads = jax.jit(jax.vmap(lambda scene, state: loads(scene, 0.0, state, per_term=True), (None, 0)))
+_energies = jax.jit(jax.vmap(lambda scene, state: total(scene, 0.0, state), (None, 0)))
+
+
+def _terms(flight, still=False):
+    """The force of each term of the scene on each node at every frame [N]; of nodes that do not move, if so told."""
+    states = _states(flight)
+    states = states._replace(velocity=0.0 * states.velocity) if still else states
+    return [np.asarray(term) for term in _loads(flight.scene, states)]
+
+
+def _momentum_gap(flight):
+    """Change of momentum from start to end, less the impulse of all forces on what is free [kg m/s]."""
+    mass, free = np.asarray(flight.scene.mass)[:, None], ~np.asarray(flight.scene.pinned)
+    change = np.sum(mass * (flight.velocity[-1] - flight.velocity[0]), axis=0)
+    return change - _integral(flight.time, sum(_terms(flight))[:, free].sum(axis=1))
+
+
+def _energy_gap(flight):
+    """Change of energy from start to end, less the work of the air and of the springs' damping [J]."""
+    energy = np.asarray(_energies(flight.scene, _states(flight)))
+    (_, pull, push), (_, elastic, _) = _terms(flight), _terms(flight, still=True)
+    power = np.sum((push + pull - elastic) * flight.velocity, axis=(1, 2))
+    return energy[-1] - energy[0] - _integral(flight.time, power)
+
+
+def _integral(time, rate):
+    """The integral over the whole time, by Simpson's rule."""
+    return (time[1] - time[0]) / 3 * (rate[:-2:2] + 4 * rate[1:-1:2] + rate[2::2]).sum(axis=0)
