@@ -142,3 +142,19 @@ def test_a_mask_is_held_and_pins_say_who_is(unannotated):
 def test_bad_pins_are_answered_in_plain_words(nodes, path, error, message, unannotated):
     with pytest.raises(error, match=message):
         Scene(Particles(HERE, REST), pinned=Pins(nodes, path))
+
+
+def test_a_led_lane_passes_what_others_bounce_off_in_time():
+    """Impacts of independent lanes are timed; a led lane follows its path through the floor."""
+    floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.8)
+    still = jnp.zeros((2, 2))
+    start = Particles(still.at[1, 1].set(1.0), still)
+    path = lambda t: jnp.stack([0.5 * t, -jnp.sin(t)], axis=-1)  # noqa: E731
+    pins = Pins(jnp.asarray([True, False]), path)
+    both = Scene(pins.lead(0.0, start), forces=(forces.Gravity(),), contacts=(floor,), pinned=pins)
+    alone = Scene(Particles(start.position[1], start.velocity[1]), forces=(forces.Gravity(),), contacts=(floor,))
+    one, other = (simulate(scene, methods.rk4, dt=0.01, steps=200) for scene in (both, alone))
+    np.testing.assert_allclose(one.position[:, 0], path(one.time), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(one.position[:, 1], other.position, rtol=0, atol=1e-12)
+    assert other.position[:, 1].min() > -1e-14
+    assert one.position[-1, 0, 1] < -0.8

@@ -46,10 +46,10 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
         lambda: (motion(scene, t, dt).state, since),
     )
     meets = _may_meet(scene, since, end, t, dt)
-    if scene.pinned is not None:
-        meets = meets & ~scene.pinned
-    # a plain function may hold arrays of its own that cannot be cut
-    cut = not any(isinstance(force, Function) for force in scene.forces)
+    if scene.held is not None:
+        meets = meets & ~scene.held
+    # a plain function may hold arrays of its own that cannot be cut, and a path is one of all lanes
+    cut = scene.led is None and not any(isinstance(force, Function) for force in scene.forces)
     end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), scene, t, dt, cut=cut)
     return scene.having(state=end, contacts=_remembered(scene.contacts, list(since)))
 
