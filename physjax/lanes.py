@@ -6,6 +6,7 @@ sides; `any_lane` asks all scenes of the batch together instead, so the branch s
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +18,10 @@ FEWEST = 1024
 """Scenes with fewer lanes are not worth picking lanes from."""
 SHARE = 64
 """One lane in so many is room enough for the lanes that are picked at once."""
+
+
+WHOLE = 64
+"""Scenes with no more coupled nodes are compiled as one piece, which for few nodes runs faster."""
 
 
 def is_per_lane(leaf: Any, lanes: tuple[int, ...]) -> bool:
@@ -106,19 +111,25 @@ def _picked(words: Array, upto: Array, number: Array) -> Array:
 
 
 def loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
-    """`lax.while_loop(going, body, start)`, at most so many times; quick to compile where the lanes are few.
-
-    XLA on CPU makes one function of a small loop and of everything in it, which runs faster but takes five times as long
-    to compile, or more; a scatter, be it of one number, is what it will not have there.
-    """
-    few = max(leaf.size for leaf in jax.tree.leaves(start)) < FEWEST
-    one = jnp.asarray([1, 0], jnp.int32)
+    """`lax.while_loop(going, body, start)`, at most so many times, which compiles in pieces where the lanes are few."""
+    in_pieces = max(leaf.size for leaf in jax.tree.leaves(start)) < FEWEST
 
     def again(state):
         return going(state[0]) & (state[1][0] < most)
 
     def once(state):
         carry, count = state
-        return body(carry), count.at[jnp.minimum(count, 0)].add(one) if few else count + one
+        return body(carry), lax.sort(count + 1) if in_pieces else count + 1
 
-    return lax.while_loop(again, once, (start, jnp.zeros_like(one)))[0]
+    return lax.while_loop(again, once, (start, jnp.arange(2, dtype=jnp.int32)))[0]
+
+
+@partial(jax.checkpoint, prevent_cse=False)  # so that reverse mode has a sort in its loop as well
+def in_pieces(array: Array, number: Array) -> Array:
+    """The array as it is; a loop over `number` that has this in its body is compiled in pieces.
+
+    XLA on CPU makes one function of a small loop and of everything in it. Few lines run faster so; many, such as the
+    gradient of a cloth's step, take ten times as long to compile. A sort, be it of two numbers, is what it will not
+    have there.
+    """
+    return array * (lax.sort(jnp.stack([number, number + 1]))[0] == number).astype(array.dtype)

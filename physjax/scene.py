@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, real_array, real_quantity
+from physjax.lanes import WHOLE, apart
 from physjax.vectors import scale
 
 
@@ -228,6 +229,11 @@ class Scene(eqx.Module):
         return self.pinned if hasattr(self.pinned, "lead") else None
 
     @property
+    def in_pieces(self) -> bool:
+        """Whether a step is compiled in pieces: where more than a few nodes look at each other."""
+        return self.couples and self.state.lanes[-1:] > (WHOLE,)
+
+    @property
     def status_shape(self) -> tuple[int, ...]:
         """Shape of what is decided once a scene when lanes are coupled, once a lane when not: status and step size."""
         return self.state.lanes[:-1] if self.couples else self.state.lanes
@@ -251,7 +257,10 @@ class Scene(eqx.Module):
 
     def rate(self, t: ArrayLike, state: Particles) -> Particles:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
-        return state.rate(self.acceleration(t, state))
+        if not self.in_pieces:
+            return state.rate(self.acceleration(t, state))
+        # apart, or a method's stage would be computed anew in every neighbour that looks at it
+        return state.rate(apart(jnp.isfinite(t), lambda: self.acceleration(t, state)))
 
     def kick(self, state: Particles, rate: Particles, dt: ArrayLike) -> Particles:
         """Velocities changed by the accelerations in `rate` for a time dt."""

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import quantity
+from physjax.lanes import apart
 from physjax.physics.networks import rank, take
 from physjax.scene import Force, Particles
 from physjax.vectors import cross, dot, norm, over, scale, unit
@@ -44,8 +45,7 @@ class Cells:
 
     def gathered(self, newtons: Array) -> Array:
         """The cells' forces shared among their corners, `(*scenes, nodes, 3)`."""
-        shares = lax.optimization_barrier(0.25 * newtons)
-        total = sum(self._shifted(shares, self.rows, self.columns))
+        total = 0.25 * sum(self._shifted(newtons, self.rows, self.columns))
         return total.reshape((*newtons.shape[:-3], self.nodes, newtons.shape[-1]))
 
     def _corners(self, a):
@@ -84,7 +84,6 @@ class Triangles:
     def gathered(self, newtons: Array) -> Array:
         """The triangles' forces shared among their corners, `(*scenes, nodes, 3)`."""
         shares = jnp.concatenate([newtons / 3, jnp.zeros_like(newtons[..., :1, :])], axis=-2)
-        shares = lax.optimization_barrier(shares)
         return sum(take(shares, faces) for faces in self.around)
 
 
@@ -110,6 +109,11 @@ class Wind(Force):
                 f"Wind: got positions of shape {state.position.shape}, expected (*scenes, {self.surface.nodes}, 3): the "
                 "nodes of the sheet that it was made for."
             )
+        # each node looks at several faces: apart, or their forces would be computed anew for every one of them
+        return self.surface.gathered(apart(jnp.isfinite(t), lambda: self._pushes(state)))
+
+    def _pushes(self, state: Particles) -> Array:
+        """The force on each face [N]."""
         area, velocity = self.surface.faces(*state)
         air = over(self.velocity, velocity) - velocity
         outward = unit(area)
@@ -117,4 +121,4 @@ class Wind(Force):
         push = scale(self.normal * jnp.abs(through) * through, outward)
         if self.tangential is not None:
             push = push + scale(self.tangential * norm(air), air - scale(through, outward))
-        return self.surface.gathered(scale(0.5 * self.density * norm(area), push))
+        return scale(0.5 * self.density * norm(area), push)

@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.checks import positive_integer, real_quantity
-from physjax.lanes import FEWEST
+from physjax.lanes import FEWEST, in_pieces
 from physjax.scene import Function, Scene, as_module
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
@@ -74,8 +74,7 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
     def step(i, moving, still, dt):
-        scene = eqx.combine(moving, still)
-        return eqx.filter(scene.step(method, time_at(i, dt, scene.state.dtype), dt), changing)
+        return eqx.filter(_step(eqx.combine(moving, still), method, i, dt), changing)
 
     blocks = Blocks.of(scene, moving, frame_steps=save_every) if record is None else None
 
@@ -145,11 +144,18 @@ def _is_ours(definition: Any) -> bool:
     return getattr(definition, "__module__", "").startswith("physjax.") and "<locals>" not in definition.__qualname__
 
 
+def _step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
+    """Step number i of a loop."""
+    if scene.in_pieces and jax.default_backend() == "cpu":
+        scene = scene.having(state=jax.tree.map(lambda leaf: in_pieces(leaf, i), scene.state))
+    return scene.step(method, time_at(i, dt, scene.state.dtype), dt)
+
+
 def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
     """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
     if count == 1:
         return step(first, carry)
-    inner = math.isqrt(count) if count > 16 else count
+    inner = _near_root(count) if count > 16 else count
     outer, rest = divmod(count, inner)
 
     def run(carry, first, length):
@@ -160,6 +166,13 @@ def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
     chunk = jax.checkpoint(partial(run, length=inner), prevent_cse=False)
     carry, _ = lax.scan(lambda c, i: (chunk(c, first + i * inner), None), carry, jnp.arange(outer, dtype=jnp.int32))
     return run(carry, first + outer * inner, rest) if rest else carry
+
+
+def _near_root(count: int) -> int:
+    """A length for chunks of about √count: one that leaves no rest, if there is one, since a rest is compiled once more."""
+    root = math.isqrt(count)
+    exact = [length for length in range(root // 2, 2 * root + 1) if count % length == 0]
+    return min(exact, key=lambda length: abs(length - root), default=root)
 
 
 @partial(jax.jit, static_argnames=("frames",))
@@ -173,8 +186,7 @@ def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: Array
     moving, still = eqx.partition(scene, changing)
 
     def step(i, moving):
-        scene = eqx.combine(moving, still)
-        return eqx.filter(scene.step(method, time_at(i, dt, scene.state.dtype), dt), changing)
+        return eqx.filter(_step(eqx.combine(moving, still), method, i, dt), changing)
 
     def frame(moving, index):
         moving = lax.fori_loop(index * steps_per_frame, (index + 1) * steps_per_frame, step, moving)

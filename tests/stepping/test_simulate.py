@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physjax import Particles, Scene, forces, methods, simulate
+from physjax import Particles, Scene, forces, lattices, methods, simulate
 from physjax.physics.forces import independent
 from physjax.stepping.methods import METHODS
 
@@ -350,3 +350,18 @@ def test_plain_functions_may_close_over_what_is_differentiated():
     central = (swing(2.0 + h) - swing(2.0 - h)) / (2 * h)
     np.testing.assert_allclose(jax.grad(swing)(2.0), central, rtol=1e-8)
     np.testing.assert_allclose(jax.jit(swing)(2.0), swing(2.0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("differentiated", [False, True])
+def test_a_cloths_loop_is_compiled_in_pieces(differentiated):
+    """XLA on CPU would make one function of it, which takes ten times as long: minutes for the gradient of rk4."""
+    sheet = lattices.cloth(1.0, 1.0, 9, 9, mass=0.1, structural=100.0)
+    scene = Scene(sheet.state, mass=sheet.mass, forces=(forces.Gravity(), sheet.springs))
+
+    def lowest(speed):
+        thrown = scene.having(state=Particles(scene.state.position, scene.state.velocity + speed))
+        return simulate(thrown, methods.rk4, dt=1e-3, steps=40, save_every=40).position[-1, :, 1].min()
+
+    program = jax.jit(jax.grad(lowest) if differentiated else lowest).lower(0.1).compile().as_text()
+    assert "while" in program
+    assert "small_call" not in program
