@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
 FEWEST = 1024
@@ -48,6 +49,13 @@ def apart(flag: Bool[Array, "..."], function: Callable, like: Any = None) -> Any
     if like is None:
         like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function))
     return lax.cond(any_lane(flag), function, lambda: like)
+
+
+def kept_apart(t: ArrayLike, function: Callable) -> Any:
+    """`function()`, kept apart from what reads it at any finite time t; on CPU by a branch that the compiler must believe in."""
+    if jax.default_backend() == "cpu":
+        return apart(jnp.isfinite(t), function)
+    return lax.optimization_barrier(function())
 
 
 def on_flagged(function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *others: Any, cut: bool) -> Any:

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, real_array, real_quantity
-from physjax.lanes import WHOLE, apart
+from physjax.lanes import WHOLE, kept_apart
 from physjax.vectors import scale
 
 
@@ -260,7 +260,7 @@ class Scene(eqx.Module):
         if not self.in_pieces:
             return state.rate(self.acceleration(t, state))
         # apart, or a method's stage would be computed anew in every neighbour that looks at it
-        return state.rate(apart(jnp.isfinite(t), lambda: self.acceleration(t, state)))
+        return state.rate(kept_apart(t, lambda: self.acceleration(t, state)))
 
     def kick(self, state: Particles, rate: Particles, dt: ArrayLike) -> Particles:
         """Velocities changed by the accelerations in `rate` for a time dt."""

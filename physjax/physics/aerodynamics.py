@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import quantity
-from physjax.lanes import apart
+from physjax.lanes import kept_apart
 from physjax.physics.networks import rank, take
 from physjax.scene import Force, Particles
 from physjax.vectors import cross, dot, norm, over, scale, unit
@@ -110,7 +110,7 @@ class Wind(Force):
                 "nodes of the sheet that it was made for."
             )
         # each node looks at several faces: apart, or their forces would be computed anew for every one of them
-        return self.surface.gathered(apart(jnp.isfinite(t), lambda: self._pushes(state)))
+        return self.surface.gathered(kept_apart(t, lambda: self._pushes(state)))
 
     def _pushes(self, state: Particles) -> Array:
         """The force on each face [N]."""
