@@ -99,17 +99,17 @@ class ImplicitEuler(eqx.Module):
         goal = self._floor(u) ** 2 * size
 
         def body(carry):
-            u, square, count, i = carry
+            u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
-            going = square > goal
             change, solved = self._solve(step, tangent, r, FORCING, False)
-            u, square = _searched(step, residual, u, change, square, going)
-            return u, square, count + jnp.where(going, solved.products, 0), i + 1
+            u, after = _searched(step, residual, u, change, square, going)
+            count = count + jnp.where(going, solved.products, 0)
+            return u, after, going & (after > goal) & (after < square), count, i + 1
 
         r = residual(u)
         square = step.inner(r, r)
-        start = (u, square, jnp.zeros(size.shape, jnp.int32), jnp.zeros((), jnp.int32))
-        u, square, count, _ = lax.while_loop(lambda c: any_lane(c[1] > goal) & (c[-1] < self.newton), body, start)
+        start = (u, square, square > goal, jnp.zeros(size.shape, jnp.int32), jnp.zeros((), jnp.int32))
+        u, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[2]) & (c[-1] < self.newton), body, start)
         present = size > 0
         relative = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))
         return u, Solved(relative, count, square <= goal)
