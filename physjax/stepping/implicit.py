@@ -79,7 +79,7 @@ class ImplicitEuler(eqx.Module):
         _, ahead = jax.jvp(lambda h: step.system.drift(state, h), (jnp.zeros_like(dt),), (dt,))
         _, move = jax.linearize(lambda u: step.system.drift(step.kicked_by(u), dt), step.nothing())
         b = step.kick(jax.tree.map(jnp.add, rate, push(ahead)))
-        matvec = lambda u: _minus(u, step.kick(push(move(u))))  # noqa: E731
+        matvec = lambda u: _minus(u, step.kick(push(move(step.freed(u)))))  # noqa: E731
         return self._solve(step, matvec, b, self._floor(b), getattr(near, "definite", False))
 
     def _converged(self, step: "_Step", guess: Vector) -> tuple[Vector, Solved]:
@@ -180,6 +180,11 @@ class _Step(NamedTuple):
     def nothing(self) -> Vector:
         """No change."""
         return [jnp.zeros_like(leaf) for leaf in self.picked(self.state)]
+
+    def freed(self, u: Vector) -> Vector:
+        """u without what held lanes have of it, which is nothing: the matrix then is symmetric in them as well."""
+        held = getattr(self.system, "held", None)
+        return u if held is None else [scale(1 - held.astype(leaf.dtype), leaf) for leaf in u]
 
     def kicked_by(self, u: Vector) -> Any:
         """The state with u added to what a kick changes."""
