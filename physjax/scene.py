@@ -85,6 +85,7 @@ class Force(eqx.Module):
     also gives its `potential(t, state, mass)` [J], shaped like the lanes (a shared energy is halved between its two
     lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
     One that jumps in time has `during(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
+    `near(t, state, mass) -> force` is its tangent for implicit steps; one that is `definite` always pushes back.
     """
 
     couples: ClassVar[bool] = False
@@ -274,6 +275,16 @@ class Scene(eqx.Module):
         """The scene as one step sees it: forces that jump in time replaced by their mean over the step."""
         forces = tuple(f.during(t, dt, self.state) if hasattr(f, "during") else f for f in self.forces)
         return eqx.tree_at(lambda scene: scene.forces, self, forces)
+
+    @property
+    def definite(self) -> bool:
+        """Whether every force pushes back, symmetrically: an implicit step may then use conjugate gradients."""
+        return all(getattr(force, "definite", False) for force in self.forces)
+
+    def near(self, t: ArrayLike, state: Particles) -> "Scene":
+        """The scene as an implicit step sees it: forces that have a tangent at this state replaced by it."""
+        state = state if self.led is None else self.led.lead(t, state)
+        return self.having(forces=tuple(f.near(t, state, self.mass) if hasattr(f, "near") else f for f in self.forces))
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""

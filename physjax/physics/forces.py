@@ -6,6 +6,7 @@ finite values and derivatives at rest and at coincident points.
 
 import math
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,6 +39,7 @@ __all__ = [
 class Gravity(Field):
     """Weight near the ground: F = m g, down the axis `up` (1: y). The lecture prints g = -9.8; here g > 0 and up is up."""
 
+    definite: ClassVar[bool] = True
     g: Float[Array, "..."] = quantity("g", "m/s²", default=9.8)
     up: int = eqx.field(static=True, default=1)
 
@@ -53,6 +55,7 @@ class Gravity(Field):
 class Constant(Force):
     """The same force at all times: F = F₀ [N]."""
 
+    definite: ClassVar[bool] = True
     force: Float[Array, "..."] = quantity("force", "N")
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
@@ -144,6 +147,7 @@ class StokesDrag(Force):
     The lecture's drag at low velocity.
     """
 
+    definite: ClassVar[bool] = True
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
     wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
 
@@ -162,6 +166,7 @@ class StokesDrag(Force):
 class QuadraticDrag(Force):
     """Drag at high velocity: F = -½ρC_dA |v| v, v relative to the wind. The lecture prints it without its minus sign."""
 
+    definite: ClassVar[bool] = True
     area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
     coefficient: Float[Array, "..."] = quantity("drag coefficient C_d", "1", at_least=0)
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
@@ -181,6 +186,7 @@ class SphereDrag(Force):
     [kg/m³], viscosity [Pa s].
     """
 
+    definite: ClassVar[bool] = True
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", above=0, default=1.204)
     viscosity: Float[Array, "..."] = quantity("viscosity", "Pa s", above=0, default=1.81e-5)
@@ -222,6 +228,7 @@ class Buoyancy(Force):
     `surface` [m] of the fluid; the part below it counts, V = πh²(3r - h)/3 for a submerged depth h.
     """
 
+    definite: ClassVar[bool] = True
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0)
     volume: Float[Array, "..."] | None = quantity("volume", "m³", at_least=0, default=None)
     radius: Float[Array, "..."] | None = quantity("radius", "m", above=0, default=None)

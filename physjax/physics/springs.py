@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.physics.networks import Network
+from physjax.physics.tangents import SpringsTangent, product, tangent_numbers
 from physjax.scene import Force, Particles
 from physjax.vectors import dot, norm, unit
 
@@ -27,6 +28,7 @@ class Springs(Force):
     """
 
     couples: ClassVar[bool] = True
+    definite: ClassVar[bool] = True
     network: Network = eqx.field(static=True)
     k: Float[Array, "..."]
     L: Float[Array, "..."]
@@ -103,23 +105,37 @@ class Springs(Force):
         pulls = []
         for slot, (edge, d) in enumerate(zip(network.edges(state.position), parts[0], strict=True)):
             k, L = self._at(slot, self.k, d), self._at(slot, self.L, d)
-            square = _product(d, d)
+            square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
             pull = k * (apart - L * _root(square))
             if damped:
-                pull = pull + self._at(slot, self.c, d) * _product(d, parts[1][slot])
+                pull = pull + self._at(slot, self.c, d) * product(d, parts[1][slot])
             # kept apart, or it would be computed anew for every component and both ends; a division at the end is what
             # older compilers keep apart by themselves
             weight = lax.optimization_barrier(jnp.where(self._at(slot, self._holding, d), pull, 0.0) / apart)
             pulls.append(network.ways.scaled(weight, edge))
         return network.resultant(pulls)
 
+    def near(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> SpringsTangent:
+        """The springs near a state, with a derivative that always pushes back: what an implicit step sees of them."""
+        springs = []
+        x = state.position
+        for slot, (edge, d) in enumerate(zip(self.network.edges(x), self.network.parts(x)[0], strict=True)):
+            square = product(d, d)
+            apart = jnp.where(square > 0, square, 1.0)
+            holding = self._at(slot, self._holding, d)
+            k = jnp.where(holding, self._at(slot, self.k, d), 0.0)
+            g, h = tangent_numbers(k, self._at(slot, self.L, d) * _root(square) / apart, apart)
+            gamma = None if self.c is None else jnp.where(holding, self._at(slot, self.c, d), 0.0) / apart
+            springs.append((edge, d, g, h, gamma))
+        return SpringsTangent(self.network, state, self(t, state, mass), springs)
+
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
         """½k(l - L)² [J], halved between the two ends."""
         self._demand_nodes(state)
         energies = []
         for slot, d in enumerate(self.network.parts(state.position)[0]):
-            stretch = _root(_product(d, d)) - self._at(slot, self.L, d)
+            stretch = _root(product(d, d)) - self._at(slot, self.L, d)
             energy = 0.25 * self._at(slot, self.k, d) * stretch * stretch
             energies.append(jnp.where(self._at(slot, self._holding, d), energy, 0.0))
         return self.network.ways.shared(energies)
@@ -136,7 +152,7 @@ class Springs(Force):
         held = []
         for slot, d in enumerate(self.network.parts(state.position)[0]):
             L, limit = self._at(slot, self.L, d), self._at(slot, self.limit, d)
-            square = _product(d, d)
+            square = product(d, d)
             held.append(self._at(slot, self.intact, d) & (square <= (L * (1 + limit)) ** 2))
         intact = self.network.ways.owned(held)
         if intact.shape != self.intact.shape:
@@ -224,11 +240,3 @@ def _root_jvp(primals, tangents):
     (square,), (change,) = primals, tangents
     root = _root(square)
     return root, 0.5 * change * jnp.where(square > 0, 1.0 / jnp.where(square > 0, root, 1.0), 0.0)
-
-
-def _product(a: list[Array], b: list[Array]) -> Array:
-    """a·b from lists of components."""
-    total = a[0] * b[0]
-    for p, q in zip(a[1:], b[1:], strict=True):
-        total = total + p * q
-    return total

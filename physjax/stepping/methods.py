@@ -6,43 +6,14 @@ or have the shape of the lanes.
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 from jax.typing import ArrayLike
 
+from physjax.stepping.implicit import ImplicitEuler
+from physjax.stepping.registry import METHODS, Promises, promises
 from physjax.vectors import scale
-
-METHODS: dict[str, Callable] = {}
-"""Every method by name, in the order of their definition; charts, tests and tables iterate it."""
-
-
-class Promises(NamedTuple):
-    """What a method promises, each measured by the tests.
-
-    `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stable_to`: the largest
-    stable ω·dt on the undamped oscillator. `order_with_drag`: the order once forces depend on velocity, where it
-    differs.
-    """
-
-    order: int
-    evaluations: int
-    stable_to: float
-    order_with_drag: int
-
-
-def promises(
-    *, order: int, evaluations: int, stable_to: float, order_with_drag: int | None = None
-) -> Callable[[Callable], Callable]:
-    """Attach promises to a method (`method.promises`) and enter it in `METHODS`."""
-
-    def attach(method: Callable) -> Callable:
-        method.promises = Promises(order, evaluations, stable_to, order if order_with_drag is None else order_with_drag)
-        METHODS[method.__name__] = method
-        return method
-
-    return attach
 
 
 @promises(order=1, evaluations=1, stable_to=0.0)
@@ -105,6 +76,25 @@ def rk4(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
     k4 = system.rate(t + dt, _along(state, k3, dt))
     slope = jax.tree.map(lambda a, b, c, d: a + 2.0 * b + 2.0 * c + d, k1, k2, k3, k4)
     return _along(state, slope, dt / 6)
+
+
+implicit_euler = ImplicitEuler()
+"""Implicit Euler, linearised once a step: stable at any step, damps; `ImplicitEuler(newton=20)` converges the full step."""
+METHODS[implicit_euler.__name__] = implicit_euler
+
+__all__ = [
+    "METHODS",
+    "ImplicitEuler",
+    "Promises",
+    "euler",
+    "implicit_euler",
+    "leapfrog",
+    "midpoint",
+    "promises",
+    "rk4",
+    "semi_implicit_euler",
+    "verlet",
+]
 
 
 def _along(state: Any, slope: Any, dt: ArrayLike) -> Any:

@@ -1,5 +1,7 @@
 """Pictures have axes with units, the data that was given, and the same style for the same method."""
 
+import math
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -46,7 +48,8 @@ def test_a_study_is_drawn_with_its_failures():
     assert "energy" in kept.get_ylabel()
     assert speed.get_xscale() == speed.get_yscale() == "log"
     crosses = [line for line in order.lines if line.get_marker() == "x" and len(line.get_xdata())]
-    assert len(crosses) == len(METHODS)  # every method fails at a sixth of a second on the stiff spring
+    limited = [method for method in METHODS.values() if math.isfinite(method.promises.stable_to)]
+    assert len(crosses) == len(limited)  # every explicit method fails at a sixth of a second on the stiff spring
     legend = " ".join(text.get_text() for text in figure.legends[0].get_texts())
     assert "rk4: order" in legend
     assert "failed" in legend

@@ -27,7 +27,15 @@ def thrown(method, dt, steps, dtype=float):
 
 @pytest.mark.parametrize(
     ("name", "share"),
-    [("euler", 0.5), ("semi_implicit_euler", -0.5), ("midpoint", 0), ("verlet", 0), ("leapfrog", 0), ("rk4", 0)],
+    [
+        ("euler", 0.5),
+        ("semi_implicit_euler", -0.5),
+        ("midpoint", 0),
+        ("verlet", 0),
+        ("leapfrog", 0),
+        ("rk4", 0),
+        ("implicit_euler", -0.5),
+    ],
 )
 def test_constant_acceleration_is_exact_or_off_by_exactly_half_a_step(name, share, precision):
     dt, steps = 0.125, 64
@@ -66,7 +74,10 @@ def test_stable_to_its_limit_and_not_beyond(method):
         one_step = lambda y: jnp.concatenate(method(scene, 0.0, Particles(y[:1], y[1:]), step))  # noqa: E731
         return np.abs(np.linalg.eigvals(np.asarray(jax.jacfwd(one_step)(jnp.zeros(2))))).max()
 
-    if limit:
+    if math.isinf(limit):
+        for step in (0.01, 1.0, 1e3):
+            assert radius(step) == pytest.approx(1 / math.hypot(1, step), rel=1e-12)
+    elif limit:
         assert radius(0.98 * limit) <= 1 + 1e-12
         assert radius(1.02 * limit) > 1 + 1e-3
     else:

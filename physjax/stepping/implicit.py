@@ -1,0 +1,290 @@
+"""Implicit Euler: the force at the end of the step moves the state, so that no step is too long for stiff springs.
+
+The equation of a step is linear in what a kick changes, u: u = dt·K rate(t + dt, drift(state + u, dt)), with K what a
+kick takes from a rate. For particles u = Δv, and linearised at the start (D. Baraff and A. Witkin, "Large steps in cloth
+simulation", 1998) it is (1 - dt ∂a/∂v - dt² ∂a/∂x) Δv = dt (a + dt ∂a/∂x v), a and its derivatives at (t + dt, x, v).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+
+from physjax.lanes import any_lane
+from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, stabilised_biconjugate_gradients
+from physjax.stepping.registry import Promises
+from physjax.vectors import scale
+
+FORCING = 1e-3
+"""Relative residual of the linear systems inside Newton's method: three digits an iteration."""
+HALVINGS = 8
+"""How often a Newton step that does not lower the residual is halved before it is given up."""
+
+
+class ImplicitEuler(eqx.Module):
+    """Implicit Euler: kick with the force at the end of the step, then drift. Stable at any step on linear springs.
+
+    Damps an oscillation by 1/√(1 + ω²dt²) a step, whether that is meant or not. Once a step the force is linearised
+    (`newton` = 0); `newton` > 0 converges the full equation in at most so many steps of Newton's method. Independent
+    lanes solve a small system each, coupled scenes one for each scene by at most `iterations` products with its matrix:
+    conjugate gradients where every force always pushes back (springs do, by their `near`), BiCGSTAB otherwise.
+    `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass. A solve that does not
+    converge raises nothing: `report` says so, with its residual. Derivatives go through the solution, not the
+    iterations. Raises ValueError or TypeError for bad settings.
+    """
+
+    tolerance: float = eqx.field(static=True, default=1e-8)
+    iterations: int = eqx.field(static=True, default=1000)
+    newton: int = eqx.field(static=True, default=0)
+
+    promises = Promises(order=1, evaluations=1, stable_to=float("inf"), order_with_drag=1)
+
+    def __check_init__(self):
+        if not isinstance(self.tolerance, int | float) or not 0 < self.tolerance < 1:
+            raise ValueError(
+                f"ImplicitEuler: got tolerance={self.tolerance!r}, expected a number between 0 and 1: the relative residual."
+            )
+        for name, least in (("iterations", 1), ("newton", 0)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"ImplicitEuler: got {name}={value!r}, expected an integer of at least {least}.")
+
+    @property
+    def __name__(self) -> str:
+        return "implicit_euler" if not self.newton else "implicit_euler, converged"
+
+    def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+        """The state after a step dt [s] from the time t [s]."""
+        return self._step(system, t, state, dt)[0]
+
+    def report(self, scene: Any, dt: ArrayLike, t: ArrayLike = 0.0) -> Solved:
+        """How the step from `scene.state` is solved: relative residual, products with the matrix, ok; for each scene."""
+        return _reported(self, scene, jnp.asarray(t, scene.state.dtype), jnp.asarray(dt, scene.state.dtype))
+
+    def _step(self, system, t, state, dt):
+        step = _Step.of(system, t, state, dt)
+        u, solved = self._linearised(step)
+        if self.newton:
+            u, solved = self._converged(step, lax.stop_gradient(u))
+        return step.ended(u), solved
+
+    def _linearised(self, step: "_Step") -> tuple[Vector, Solved]:
+        """u from the equation linearised at the start of the step."""
+        near, state, dt = step.near(), step.state, step.dt
+        rate, push = jax.linearize(lambda y: near.rate(step.end, y), state)
+        _, ahead = jax.jvp(lambda h: step.system.drift(state, h), (jnp.zeros_like(dt),), (dt,))
+        _, move = jax.linearize(lambda u: step.system.drift(step.kicked_by(u), dt), step.nothing())
+        b = step.kick(jax.tree.map(jnp.add, rate, push(ahead)))
+        matvec = lambda u: _minus(u, step.kick(push(move(step.freed(u)))))  # noqa: E731
+        return self._solve(step, matvec, b, self._floor(b), getattr(near, "definite", False))
+
+    def _converged(self, step: "_Step", guess: Vector) -> tuple[Vector, Solved]:
+        """u from the full equation, by Newton's method from a guess; its derivative by the implicit function theorem."""
+
+        def residual(u):
+            return _minus(u, step.kick(step.system.rate(step.end, step.ended(u))))
+
+        def tangent(g, y):
+            return self._solve(step, g, y, self._floor(y), False)[0]
+
+        return lax.custom_root(residual, guess, lambda f, u: self._newton(step, f, u), tangent, has_aux=True)
+
+    def _newton(self, step: "_Step", residual: Callable, u: Vector) -> tuple[Vector, Solved]:
+        zero = residual(step.nothing())
+        size = step.inner(zero, zero)
+        goal = self._floor(u) ** 2 * size
+
+        def body(carry):
+            u, square, going, count, i = carry
+            r, tangent = jax.linearize(residual, u)
+            change, solved = self._solve(step, tangent, r, FORCING, False)
+            u, after = _searched(step, residual, u, change, square, going)
+            count = count + jnp.where(going, solved.products, 0)
+            return u, after, going & (after > goal) & (after < square), count, i + 1
+
+        r = residual(u)
+        square = step.inner(r, r)
+        start = (u, square, square > goal, jnp.zeros(size.shape, jnp.int32), jnp.zeros((), jnp.int32))
+        u, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[2]) & (c[-1] < self.newton), body, start)
+        present = size > 0
+        relative = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))
+        return u, Solved(relative, count, square <= goal)
+
+    def _floor(self, b: Vector) -> float:
+        """The tolerance, or what rounding leaves of it."""
+        return max(self.tolerance, 4 * float(jnp.finfo(b[0].dtype).eps))
+
+    def _solve(
+        self, step: "_Step", matvec: Callable, b: Vector, tolerance: float, definite: bool
+    ) -> tuple[Vector, Solved]:
+        """matvec(u) = b: in closed form where lanes stand alone, else iteratively."""
+        if step.alone and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED:
+            u = _lane_by_lane(matvec, b[0])
+            r = _minus(b, matvec([u]))
+            return [u], _direct(step, r, b, tolerance)
+        iterate = conjugate_gradients if definite else stabilised_biconjugate_gradients
+
+        def solve(matvec, b):
+            return iterate(matvec, b, step.inner, tolerance, self.iterations)
+
+        def transposed(matvec, b):  # self-adjoint with the masses' inverse where the matrix is with the masses
+            return iterate(matvec, b, step.inner_of_dual, tolerance, self.iterations)
+
+        return lax.custom_linear_solve(matvec, b, solve, transposed, has_aux=True)
+
+
+class _Step(NamedTuple):
+    """A step to be solved: the system, the end of the step [s], the start's state, and which of its leaves a kick changes."""
+
+    system: Any
+    end: ArrayLike
+    state: Any
+    dt: ArrayLike
+    places: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> "_Step":
+        places = []
+
+        def kick(state):
+            after = system.kick(state, state, dt)
+            pairs = zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True)
+            places.extend(before is not now for before, now in pairs)
+            return after
+
+        jax.eval_shape(kick, state)
+        dtype = jax.tree.leaves(state)[0].dtype
+        return cls(system, t + dt, state, jnp.asarray(dt, dtype), tuple(places))
+
+    @property
+    def alone(self) -> bool:
+        """Whether each lane is a system of its own."""
+        return not getattr(self.system, "couples", True) or getattr(self.state, "lanes", None) == ()
+
+    def near(self) -> Any:
+        """The system that is linearised."""
+        return self.system.near(self.end, self.state) if hasattr(self.system, "near") else self.system
+
+    def picked(self, tree: Any) -> Vector:
+        """The leaves of a state that a kick changes."""
+        return [leaf for leaf, place in zip(jax.tree.leaves(tree), self.places, strict=True) if place]
+
+    def kick(self, rate: Any) -> Vector:
+        """dt·rate, of the leaves that a kick changes."""
+        return self.picked(self.system.kick(jax.tree.map(jnp.zeros_like, self.state), rate, self.dt))
+
+    def nothing(self) -> Vector:
+        """No change."""
+        return [jnp.zeros_like(leaf) for leaf in self.picked(self.state)]
+
+    def freed(self, u: Vector) -> Vector:
+        """u without what held lanes have of it, which is nothing: the matrix then is symmetric in them as well."""
+        held = getattr(self.system, "held", None)
+        return u if held is None else [scale(1 - held.astype(leaf.dtype), leaf) for leaf in u]
+
+    def kicked_by(self, u: Vector) -> Any:
+        """The state with u added to what a kick changes."""
+        leaves, tree = jax.tree.flatten(self.state)
+        more = iter(u)
+        return jax.tree.unflatten(
+            tree, [leaf + next(more) if place else leaf for leaf, place in zip(leaves, self.places, strict=True)]
+        )
+
+    def ended(self, u: Vector) -> Any:
+        """The state at the end of the step."""
+        return self.system.drift(self.kicked_by(u), self.dt)
+
+    def inner(self, a: Vector, b: Vector) -> jax.Array:
+        """Σ m a·b for each system."""
+        return self._sum([scale(self._mass(), p) for p in a], b)
+
+    def inner_of_dual(self, a: Vector, b: Vector) -> jax.Array:
+        """Σ a·b/m for each system."""
+        return self._sum([scale(1 / self._mass(), p) for p in a], b)
+
+    def _mass(self):
+        mass = getattr(self.system, "mass", 1.0)
+        return mass if hasattr(mass, "ndim") else jnp.ones((), self.dt.dtype)
+
+    def _sum(self, a, b):
+        kept = len(getattr(self.system, "status_shape", ()))
+        return sum(_total(p * q, kept) for p, q in zip(a, b, strict=True))
+
+
+def _total(a: jax.Array, kept: int) -> jax.Array:
+    """The sum over all axes but the first `kept`."""
+    return jnp.sum(a, axis=tuple(range(kept, a.ndim)))
+
+
+def _minus(a: Vector, b: Vector) -> Vector:
+    return [p - q for p, q in zip(a, b, strict=True)]
+
+
+def _searched(step, residual, u, change, square, going):
+    """u - change, each system's change halved until its residual falls, left out where that does not help."""
+
+    def tried(share):
+        new = [a - scale(share, b) for a, b in zip(u, change, strict=True)]
+        r = residual(new)
+        return step.inner(r, r)
+
+    def halve(carry):
+        share, found, i = carry
+        share = jnp.where(found < square, share, share / 2)
+        return share, tried(share), i + 1
+
+    whole = going.astype(square.dtype)
+    start = (whole, tried(whole), jnp.zeros((), jnp.int32))
+    share, found, _ = lax.while_loop(lambda c: any_lane(going & ~(c[1] < square)) & (c[-1] < HALVINGS), halve, start)
+    share = jnp.where(found < square, share, 0.0)
+    new = [a - scale(share, b) for a, b in zip(u, change, strict=True)]
+    return new, jnp.where(found < square, found, square)
+
+
+def _lane_by_lane(matvec: Callable, b: jax.Array) -> jax.Array:
+    """The solution of a small system for each lane, by Cramer's rule."""
+    dim = b.shape[-1]
+    units = [jnp.broadcast_to(jnp.eye(dim, dtype=b.dtype)[i], b.shape) for i in range(dim)]
+    columns = [[matvec([e])[0][..., i] for i in range(dim)] for e in units]
+    return jnp.stack(_CLOSED[dim](columns, [b[..., i] for i in range(dim)]), axis=-1)
+
+
+def _cramer_1(columns, b):
+    return [b[0] / columns[0][0]]
+
+
+def _cramer_2(columns, b):
+    p, q = columns
+    det = lambda a, b: a[0] * b[1] - a[1] * b[0]  # noqa: E731
+    whole = det(p, q)
+    return [det(b, q) / whole, det(p, b) / whole]
+
+
+def _cramer_3(columns, b):
+    p, q, r = columns
+
+    def det(a, b, c):
+        first, second, third = (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2] for i in range(3))
+        return a[0] * first + a[1] * second + a[2] * third
+
+    whole = det(p, q, r)
+    return [det(b, q, r) / whole, det(p, b, r) / whole, det(p, q, b) / whole]
+
+
+_CLOSED = {1: _cramer_1, 2: _cramer_2, 3: _cramer_3}
+
+
+def _direct(step: _Step, r: Vector, b: Vector, tolerance: float) -> Solved:
+    size, square = step.inner(b, b), step.inner(r, r)
+    present = size > 0
+    relative = jnp.sqrt(square / jnp.where(present, size, 1.0))
+    return Solved(relative, jnp.full(size.shape, b[0].shape[-1], jnp.int32), relative <= tolerance)
+
+
+@jax.jit
+def _reported(method: ImplicitEuler, scene: Any, t: jax.Array, dt: jax.Array) -> Solved:
+    return method._step(scene.during(t, dt), t, scene.state, dt)[1]

@@ -1,0 +1,99 @@
+"""Linear systems solved without their matrix: conjugate gradients, and a method for those that are not symmetric.
+
+Unknowns are lists of arrays, many systems side by side: `inner(a, b)` gives a number for each system, and each stops by
+itself when its residual |b - A x| has fallen to `tolerance` |b|. Nothing raises: what did not converge says so in its
+residual. Not differentiable by themselves; `lax.custom_linear_solve` makes them so.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from physjax.lanes import any_lane
+from physjax.vectors import scale
+
+Vector = list[Array]
+
+
+class Solved(NamedTuple):
+    """How a solve went: relative residual, products with the matrix, and whether the residual is what was asked for."""
+
+    residual: Float[Array, "..."]
+    products: Int[Array, "..."]
+    ok: Bool[Array, "..."]
+
+
+def conjugate_gradients(
+    matvec: Callable[[Vector], Vector], b: Vector, inner: Callable, tolerance: float, most: int
+) -> tuple[Vector, Solved]:
+    """A x = b for A self-adjoint in `inner` and positive: one product an iteration (Hestenes and Stiefel 1952).
+
+    Stops at a direction along which A is not positive, and after `most` products.
+    """
+    size = inner(b, b)
+    goal = tolerance**2 * size
+
+    def body(carry):
+        x, r, p, square, going, count, i = carry
+        q = matvec(p)
+        bend = inner(p, q)
+        going = going & (bend > 0)
+        alpha = _ratio(square, bend, going)
+        x, r = _plus(x, alpha, p), _plus(r, -alpha, q)
+        after = inner(r, r)
+        p = _plus(r, _ratio(after, square, going), p)
+        return x, r, p, jnp.where(going, after, square), going & (after > goal), count + going.astype(jnp.int32), i + 1
+
+    none = jnp.zeros(size.shape, jnp.int32)
+    start = ([jnp.zeros_like(e) for e in b], b, b, size, size > goal, none, jnp.zeros((), jnp.int32))
+    x, _, _, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[4]) & (c[-1] < most), body, start)
+    return x, _solved(square, size, goal, count)
+
+
+def stabilised_biconjugate_gradients(
+    matvec: Callable[[Vector], Vector], b: Vector, inner: Callable, tolerance: float, most: int
+) -> tuple[Vector, Solved]:
+    """A x = b for any A that is not too far from 1: two products an iteration (BiCGSTAB, van der Vorst 1992)."""
+    size = inner(b, b)
+    goal = tolerance**2 * size
+
+    def body(carry):
+        x, r, p, rho, square, going, count, i = carry
+        v = matvec(p)
+        alpha = _ratio(rho, inner(b, v), going)
+        s = _plus(r, -alpha, v)
+        w = matvec(s)
+        omega = _ratio(inner(w, s), inner(w, w), going)
+        x = _plus(_plus(x, alpha, p), omega, s)
+        r = _plus(s, -omega, w)
+        after, shadow = inner(r, r), inner(b, r)
+        beta = _ratio(shadow * alpha, rho * omega, going)
+        p = _plus(r, beta, _plus(p, -omega, v))
+        count, square = count + 2 * going.astype(jnp.int32), jnp.where(going, after, square)
+        going = going & (after > goal) & (shadow != 0) & (omega != 0)
+        return x, r, p, jnp.where(going, shadow, rho), square, going, count, i + 2
+
+    none = jnp.zeros(size.shape, jnp.int32)
+    start = ([jnp.zeros_like(e) for e in b], b, b, size, size, size > goal, none, jnp.zeros((), jnp.int32))
+    x, _, _, _, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[5]) & (c[-1] < most), body, start)
+    return x, _solved(square, size, goal, count)
+
+
+def _plus(x: Vector, number: Array, y: Vector) -> Vector:
+    """x + number·y, the number one for each system."""
+    return [a + scale(number, b) for a, b in zip(x, y, strict=True)]
+
+
+def _ratio(above: Array, below: Array, going: Array) -> Array:
+    """A quotient for the systems that go on, zero for the others and where it is none."""
+    good = going & (below != 0)
+    return jnp.where(good, above, 0.0) / jnp.where(good, below, 1.0)
+
+
+def _solved(square: Array, size: Array, goal: Array, count: Array) -> Solved:
+    present = size > 0
+    residual = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))
+    return Solved(residual, count, square <= goal)

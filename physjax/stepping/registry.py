@@ -1,0 +1,34 @@
+"""The registry of methods, and what a method promises. Charts, tests and tables iterate it; nobody lists methods twice."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+METHODS: dict[str, Callable] = {}
+"""Every method by name, in the order of their definition."""
+
+
+class Promises(NamedTuple):
+    """What a method promises, each measured by the tests.
+
+    `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stable_to`: the largest
+    stable ω·dt on the undamped oscillator. `order_with_drag`: the order once forces depend on velocity, where it
+    differs.
+    """
+
+    order: int
+    evaluations: int
+    stable_to: float
+    order_with_drag: int
+
+
+def promises(
+    *, order: int, evaluations: int, stable_to: float, order_with_drag: int | None = None
+) -> Callable[[Callable], Callable]:
+    """Attach promises to a method (`method.promises`) and enter it in `METHODS`."""
+
+    def attach(method: Callable) -> Callable:
+        method.promises = Promises(order, evaluations, stable_to, order if order_with_drag is None else order_with_drag)
+        METHODS[method.__name__] = method
+        return method
+
+    return attach
