@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import jax
 from jax.typing import ArrayLike
 
+from physjax.stepping.adaptive import adaptive as adaptive
+from physjax.stepping.adaptive import count_steps as count_steps
 from physjax.vectors import scale
 
 METHODS: dict[str, Callable] = {}
