@@ -167,3 +167,12 @@ def follows_rates(method: Callable) -> bool:
     rate = SmallMotion(stiffness, damping, None)._rate_matrix()
     step = np.asarray(step_matrices(method, *map(jnp.asarray, (stiffness[None], damping[None])), jnp.full(1, 0.3)))[0]
     return bool(np.abs(step @ rate - rate @ step).max() < 1e-12)
+
+
+def rate_text(rate: complex) -> str:
+    """A rate in few digits, as real, imaginary or the pair that it belongs to."""
+    if abs(rate.imag) < 1e-9 * abs(rate):
+        return f"{rate.real:.4g}"
+    return (
+        f"±{abs(rate.imag):.4g}i" if abs(rate.real) < 1e-9 * abs(rate) else f"{rate.real:.4g} ± {abs(rate.imag):.4g}i"
+    )

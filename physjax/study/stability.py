@@ -16,9 +16,11 @@ from physjax.physics.springs import Springs
 from physjax.scene import Force, Particles, Scene, as_module
 from physjax.show.report import seconds_text
 from physjax.stepping.reference import in_dtype
+from physjax.study.explain import Explanation, explained
 from physjax.study.growth import grows, measure_growth, measure_limit
-from physjax.study.small_motion import SmallMotion, follows_rates, radius, small_motion, step_matrices
+from physjax.study.small_motion import SmallMotion, follows_rates, radius, rate_text, small_motion, step_matrices
 from physjax.study.stability_map import StabilityMap, run_map
+from physjax.trajectory import Trajectory
 
 RESTING = 1e-6
 """Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
@@ -63,7 +65,7 @@ class Limit(NamedTuple):
             return f"{self.method}: any step is stable, nothing swings or decays"
         reach = "no step is stable" if self.dt == 0 else "any step is stable" if np.isinf(self.dt) else ""
         where = "" if self.spring is None else f" (the spring between nodes {self.spring[0]} and {self.spring[1]})"
-        what = f"set by the {self.cause} of {self.force}{where}, λ = {_rate_text(self.rate)} 1/s"
+        what = f"set by the {self.cause} of {self.force}{where}, λ = {rate_text(self.rate)} 1/s"
         return f"{self.method}: {reach or seconds_text(self.dt)}, {what}"
 
 
@@ -131,6 +133,16 @@ def map(
     gone, diverged one of more than ten times that way. Each dt is rounded to divide a quarter of the duration.
     """
     return run_map(scene, [_checked(method) and method for method in methods], dts, parameter, duration, limit)
+
+
+def explain(
+    run: Trajectory | Scene, method: Callable | None = None, dt: float | None = None, *, steps: int = 1200
+) -> Explanation:
+    """Why a run blew up or went astray: where, the force and the eigenvalue responsible, the limit broken, two cures.
+
+    Give a trajectory, or a scene with a method and a dt [s], which is then run for `steps`. Print the result.
+    """
+    return explained(run, method, dt, steps, limit, growth)
 
 
 def name_of(method: Callable) -> str:
@@ -291,18 +303,12 @@ def _worst_spring(springs: Springs, state: Particles, moved: np.ndarray, kind: i
     return int(first), int(second)
 
 
-def _rate_text(rate: complex) -> str:
-    if abs(rate.imag) < 1e-9 * abs(rate):
-        return f"{rate.real:.4g}"
-    return (
-        f"±{abs(rate.imag):.4g}i" if abs(rate.real) < 1e-9 * abs(rate) else f"{rate.real:.4g} ± {abs(rate.imag):.4g}i"
-    )
-
-
 __all__ = [
+    "Explanation",
     "Limit",
     "Region",
     "StabilityMap",
+    "explain",
     "grows",
     "growth",
     "limit",

@@ -81,8 +81,9 @@ def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
         assert predicted.spring in [(i, i + 1) for i in range(20, 32)]
 
 
-@pytest.mark.parametrize("count", [8, pytest.param(200, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("damped", [False, True], ids=["undamped", "damped"])
+@pytest.mark.parametrize(
+    ("count", "damped"), [(8, True), *(pytest.param(200, damped, marks=pytest.mark.slow) for damped in (False, True))]
+)
 def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
     scene = networks(count, damped, *((5, 2) if count == 8 else (8, 2)))
     for name, method in METHODS.items():
@@ -111,7 +112,7 @@ def test_the_limit_of_a_cloth_of_a_thousand_nodes_is_the_measured_one(name, damp
     assert predicted.dt == pytest.approx(known.get((damping, name), predicted.dt), rel=0.02)
 
 
-@pytest.mark.parametrize("damping", [None, 10.0], ids=["undamped", "damped"])
+@pytest.mark.parametrize("damping", [pytest.param(None, marks=pytest.mark.slow), 10.0], ids=["undamped", "damped"])
 def test_what_sets_the_limit_of_a_cloth_is_its_stiffness_or_its_damping(damping):
     cloth = sheet(12, damping)  # of so many coordinates only the fastest modes are sought
     predicted = stability.limit(cloth, methods.semi_implicit_euler)
