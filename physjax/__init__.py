@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from physjax import scenes
     from physjax.physics import contacts, lattices, springs
     from physjax.show import animate, plot
-    from physjax.study import accuracy, energy, projectile
+    from physjax.study import accuracy, energy, projectile, stability
 
 __all__ = [
     "Contact",
@@ -40,6 +40,7 @@ __all__ = [
     "scenes",
     "simulate",
     "springs",
+    "stability",
 ]
 __version__ = "0.1.0"
 
@@ -54,6 +55,7 @@ _LATER = {
     "projectile": "physjax.study.projectile",
     "scenes": "physjax.scenes",
     "springs": "physjax.physics.springs",
+    "stability": "physjax.study.stability",
 }
 
 

@@ -25,6 +25,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scenes = commands.add_parser("scenes", help="list the scenes of the gallery")
     scenes.set_defaults(run=lambda options: _scenes())
 
+    stability = commands.add_parser("stability", help="which step is stable in a scene: predicted and measured limits")
+    stability.add_argument("scene", metavar="SCENE", help="a name from `physjax scenes`")
+    stability.add_argument("--out", default="stability", metavar="DIR", help="where the map goes (default: stability)")
+    stability.add_argument("--steps", type=int, default=4000, help="steps of a measuring run (default: 4000)")
+    stability.set_defaults(run=lambda options: _stability(options.scene, options.out, options.steps))
+
     options = parser.parse_args(arguments)
     try:
         options.run(options)
@@ -60,6 +66,50 @@ def _chart(names: list[str], out: str, quick: bool) -> None:
         file.write(report.page("physjax: speed against accuracy", summary, [section for _, section in results]))
     print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
     print(f"Measured on {report.machine()}.\nCharts: {folder / 'index.html'}")
+
+
+def _stability(name: str, out: str, steps: int) -> None:
+    """Print predicted and measured limits of every method in a scene; write the map as PNG."""
+    import jax
+    import matplotlib
+    import numpy as np
+
+    from physjax.checks import known, positive_integer
+    from physjax.files import replacing, writable_folder
+    from physjax.scenes import SCENES
+    from physjax.show.report import machine, table
+    from physjax.stepping.methods import METHODS
+    from physjax.study import stability
+
+    name, steps = known("scene", name, SCENES), positive_integer("steps", steps, at_least=64)
+    folder = writable_folder(out)
+    matplotlib.use("Agg")
+    with jax.enable_x64(True):
+        scene = SCENES[name]().scene
+    rows, limits = [], []
+    for method in tqdm(METHODS.values(), desc=name, unit="method", file=sys.stderr):
+        predicted = stability.limit(scene, method)
+        finite = np.isfinite(predicted.dt) and predicted.dt > 0
+        measured = float(stability.measure_limit(scene, method, steps=steps).min()) if finite else None
+        limits += [predicted.dt] if finite else []
+        rows.append([predicted.method, *_limit_texts(predicted.dt, measured), str(predicted).partition(", ")[2]])
+    print(f"\n{table(['method', 'predicted', 'measured', 'what sets it'], rows, align='<>><')}\n")
+    if limits:
+        chart = stability.map(scene, list(METHODS.values()), np.geomspace(min(limits) / 10, 3 * max(limits), 48))
+        with replacing(folder / f"{name}.png", "wb") as file:
+            chart.plot().savefig(file, dpi=110)
+        print(f"Map: {folder / f'{name}.png'}")
+    else:
+        print("No method has a limit here, so there is no map to draw.")
+    print(f"Measured on {machine()}.")
+
+
+def _limit_texts(predicted: float, measured: float | None) -> list[str]:
+    from physjax.show.report import seconds_text
+
+    if measured is None:
+        return ["none" if predicted else "never stable", "-"]
+    return [seconds_text(predicted), seconds_text(measured)]
 
 
 def _study(name: str, folder: Path, quick: bool):

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 from jax.typing import ArrayLike
 
+from physjax.stepping.adaptive import adaptive, count_steps
 from physjax.stepping.implicit import ImplicitEuler
 from physjax.stepping.registry import METHODS, Promises, promises
 from physjax.vectors import scale
@@ -86,6 +87,8 @@ __all__ = [
     "METHODS",
     "ImplicitEuler",
     "Promises",
+    "adaptive",
+    "count_steps",
     "euler",
     "implicit_euler",
     "leapfrog",

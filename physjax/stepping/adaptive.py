@@ -1,0 +1,233 @@
+"""Steps that choose their own length: `adaptive(method, ...)` subdivides the dt it is given and lands on its end."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from physjax.checks import concrete, positive_integer, real_quantity
+from physjax.scene import as_module
+
+SAFETY, SHRINK, GROW = 0.9, 0.2, 5.0
+FLOOR = 1e-6
+"""The shortest step where none is given, in parts of the dt to be subdivided."""
+
+
+class Steps(NamedTuple):
+    """What one subdivided dt took: steps accepted and rejected, the shortest accepted [s], and whether it reached the end.
+
+    Shaped like the scene's status: for each lane where lanes are independent, for each scene where they are coupled.
+    """
+
+    state: Any
+    accepted: Int[Array, "..."]
+    rejected: Int[Array, "..."]
+    shortest: Float[Array, "..."]
+    ok: Bool[Array, "..."]
+
+
+class Adaptive(eqx.Module):
+    """A method that takes each of its steps whole and in two halves, and calls the difference its error.
+
+    Made by `adaptive`; `report` also tells the steps it took.
+    """
+
+    method: Any
+    atol: Float[Array, ""]
+    rtol: Float[Array, ""]
+    dt_min: Float[Array, ""] | None
+    dt_max: Float[Array, ""] | None
+    order: int = eqx.field(static=True)
+    error: str = eqx.field(static=True)
+    tries: int | None = eqx.field(static=True)
+
+    def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+        """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
+        return self.report(system, t, state, dt).state
+
+    def report(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Steps:
+        """The state a dt later, with the counts of accepted and rejected steps."""
+        shape, kind = getattr(system, "status_shape", ()), jax.tree.leaves(state)[0].dtype
+        dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
+        floor = FLOOR * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
+        # less than rounding would never arrive
+        floor = jnp.maximum(floor, 16 * jnp.finfo(kind).eps * dt)
+        ceiling = dt if self.dt_max is None else jnp.minimum(self.dt_max.astype(kind), dt)
+        h = jnp.clip(self._first(system, t, state, dt), floor, ceiling)
+        none = jnp.zeros(shape, jnp.int32)
+        start = _Walk(state, jnp.zeros(shape, kind), lax.stop_gradient(h), none, none, dt, jnp.zeros(shape, bool))
+        attempt = partial(self._attempt, system, t, dt, floor, ceiling)
+        if self.tries is None:
+            end = lax.while_loop(lambda walk: jnp.any(walk.going(dt)), attempt, start)
+        else:
+            end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
+        ok = ~end.failed & ~end.going(dt)
+        state = jax.tree.map(lambda leaf: jnp.where(_wide(ok, leaf), leaf, jnp.nan), end.state)
+        return Steps(state, end.accepted, end.rejected, end.shortest, ok)
+
+    def _attempt(self, system: Any, t: Any, dt: Any, floor: Any, ceiling: Any, walk: "_Walk") -> "_Walk":
+        """One step whole and in halves, kept if both agree, and the next length from how well they do."""
+        going, left = walk.going(dt), dt - walk.elapsed
+        # two equal steps to the end rather than a long and a tiny one
+        last = walk.h >= left
+        h = jnp.where(last, left, jnp.where(2 * walk.h > left, left / 2, walk.h))
+        h = jnp.where(going, h, 0.0)
+        now = t + walk.elapsed
+        whole = self.method(system, now, walk.state, h)
+        middle = self.method(system, now, walk.state, h / 2)
+        halves = self.method(system, now + h / 2, middle, h / 2)
+        error = lax.stop_gradient(self._error(walk.state, whole, halves, h.shape))
+        good = going & (error <= 1.0)
+        bad = going & ~good
+        power = -0.5 if self.error == "velocity" else -1 / (self.order + 1)
+        factor = SAFETY * jnp.maximum(error, 1e-30) ** power
+        factor = jnp.where(jnp.isfinite(error), jnp.clip(factor, SHRINK, GROW), SHRINK)
+        # cut short by the end, a step says little about how long the next may be
+        longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
+        return _Walk(
+            jax.tree.map(lambda a, b: jnp.where(_wide(good, a), a, b), halves, walk.state),
+            jnp.where(good, jnp.where(last, dt, walk.elapsed + h), walk.elapsed),
+            jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
+            walk.accepted + good.astype(jnp.int32),
+            walk.rejected + bad.astype(jnp.int32),
+            jnp.where(good, jnp.minimum(walk.shortest, h), walk.shortest),
+            walk.failed | (bad & ~(h > floor)),  # so said, a length that is not a number ends as well
+        )
+
+    def _error(self, start: Any, whole: Any, halves: Any, shape: tuple) -> Array:
+        """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
+        if self.error == "velocity":
+            difference = halves.velocity - whole.velocity
+            worst = jnp.sqrt(jnp.sum(difference * difference, axis=-1))
+            return jnp.max(worst.reshape((*shape, -1)), axis=-1) / self.atol.astype(worst.dtype)
+        return _size(jax.tree.map(lambda a, b: a - b, halves, whole), self._tolerance(start, halves), shape)
+
+    def _tolerance(self, start: Any, end: Any) -> Any:
+        size = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), start, end)
+        return jax.tree.map(lambda s: self.atol.astype(s.dtype) + self.rtol.astype(s.dtype) * s, size)
+
+    def _first(self, system: Any, t: Any, state: Any, dt: Any) -> Array:
+        """A first length from how fast the state and its rate change (Hairer, Nørsett, Wanner, section II.4)."""
+        shape, tolerance = dt.shape, self._tolerance(state, state)
+        slope = system.rate(t, state)
+        size, speed = _size(state, tolerance, shape), _size(slope, tolerance, shape)
+        small = 0.01 * jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1.0), 1e30)
+        small = jnp.clip(small, FLOOR * dt, dt)
+        ahead = jax.tree.map(lambda y, k: y + _wide(small, y) * k, state, slope)
+        turn = jax.tree.map(lambda a, b: a - b, system.rate(t + small, ahead), slope)
+        bend = jnp.maximum(_size(turn, tolerance, shape) / small, 1e-30)
+        # half of y'' dt² is what a step of first order misses
+        return jnp.minimum(100 * small, (0.01 / jnp.maximum(bend, speed)) ** (1 / (self.order + 1)))
+
+
+class _Walk(NamedTuple):
+    """How far the steps have come."""
+
+    state: Any
+    elapsed: Array
+    h: Array
+    accepted: Array
+    rejected: Array
+    shortest: Array
+    failed: Array
+
+    def going(self, dt: Array) -> Array:
+        """Which have not reached the end."""
+        return (self.elapsed < dt) & ~self.failed
+
+
+def adaptive(
+    method: Callable,
+    atol: ArrayLike = 1e-6,
+    rtol: ArrayLike = 1e-6,
+    *,
+    dt_min: ArrayLike | None = None,
+    dt_max: ArrayLike | None = None,
+    order: int | None = None,
+    error: str = "state",
+    tries: int | None = None,
+) -> Adaptive:
+    """A method that subdivides its own dt so that no step's error exceeds the tolerance, by step doubling.
+
+    Each step is taken whole and in two halves; E = max |y₁ - y₂| / (atol + rtol |y|) over position and velocity. E <= 1
+    keeps the halves, otherwise the step is redone; the next is 0.9 E^(-1/(p+1)) times as long, p the method's order, at
+    most 5 times. Every independent lane has steps of its own, and all land exactly on the end of dt: 3 times the
+    evaluations of the method a try, and two to begin a dt with, so give it long ones.
+
+    `error="velocity"` is the lecture's E = |v₁ - v₂| / atol with power -1/2. It cannot see position: under gravity
+    alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s] (a millionth of dt, if
+    not given) ends that lane as NaN: `.ok` and `.first_bad_step` of a run tell. `tries` bounds the steps of one dt and
+    makes the run differentiable in reverse; more of them needed is NaN as well. Symplectic methods (semi-implicit
+    Euler, verlet, leapfrog) lose their virtue: with steps that follow the state their energy drifts.
+    """
+    if not callable(method):
+        raise TypeError(f"adaptive: got the method {method!r}, expected one such as methods.rk4.")
+    if error not in ("state", "velocity"):
+        raise ValueError(f"error: got {error!r}, expected 'state' or 'velocity' (the lecture's).")
+    promised = getattr(method, "promises", None)
+    if order is None and promised is None:
+        raise ValueError("adaptive: the method promises no order. Give order=.")
+    atol, rtol = real_quantity("atol", atol, above=0.0), real_quantity("rtol", rtol, above=0.0)
+    lengths = [
+        None if h is None else real_quantity(n, h, above=0.0) for n, h in (("dt_min", dt_min), ("dt_max", dt_max))
+    ]
+    if (
+        None not in [None if h is None else concrete(h) is not None or None for h in lengths]
+        and lengths[0] > lengths[1]
+    ):
+        raise ValueError(f"dt_min: got {lengths[0]:g} s, which is more than dt_max {lengths[1]:g} s. Exchange them.")
+    return Adaptive(
+        as_module(method),
+        atol,
+        rtol,
+        *lengths,
+        positive_integer("order", promised.order if order is None else order),
+        error,
+        None if tries is None else positive_integer("tries", tries),
+    )
+
+
+def count_steps(scene: Any, method: Adaptive, *, dt: ArrayLike, steps: int) -> Steps:
+    """Accepted and rejected steps of a run, dt by dt along a leading axis, the states at its ends with them."""
+    if not isinstance(method, Adaptive):
+        raise TypeError(f"count_steps: got {type(method).__name__}, expected methods.adaptive(...).")
+    return _counted(scene, method, real_quantity("dt [s]", dt, above=0.0), positive_integer("steps", steps))
+
+
+@eqx.filter_jit
+def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
+    dt = dt.astype(scene.state.dtype)
+    arrays, still = eqx.partition(scene, eqx.is_array)
+
+    def one(arrays, i):
+        scene = eqx.combine(arrays, still)
+        t = i.astype(scene.state.dtype) * dt
+        told = method.report(scene.during(t, dt), t, scene.state, dt)
+        after = scene.step(method, t, dt)
+        return eqx.filter(after, eqx.is_array), told._replace(state=after.state)
+
+    return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
+
+
+def _wide(number: Array, like: Array) -> Array:
+    """A number of each scene or lane, with the axes of an array of the state."""
+    return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))
+
+
+def _size(state: Any, tolerance: Any, shape: tuple) -> Array:
+    """The largest component in units of its tolerance, for each scene or lane."""
+    leaves = [jnp.abs(a / b) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(tolerance), strict=True)]
+    largest = [jnp.max(leaf.reshape((*shape, -1)), axis=-1) for leaf in leaves]
+    worst = largest[0]
+    for other in largest[1:]:
+        worst = jnp.maximum(worst, other)
+    return worst
+
+
+__all__ = ["Adaptive", "Steps", "adaptive", "count_steps"]

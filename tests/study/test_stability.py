@@ -1,0 +1,196 @@
+"""Predicted limits against measured ones, and what a prediction says of its cause."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physjax import Particles, Scene, forces, lattices, methods, springs, stability
+from physjax.scenes import SCENES
+from physjax.stepping.methods import METHODS
+
+ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+SLOW_TO_GROW = {"euler", "midpoint"}
+
+
+def oscillator(k=15.0, b=None, m=1.0):
+    drag = () if b is None else (forces.StokesDrag(b),)
+    return Scene(
+        Particles(jnp.ones(1), jnp.zeros(1)), mass=m, forces=(forces.Anchor(point=jnp.zeros(1), stiffness=k), *drag)
+    )
+
+
+def networks(count, damped, nodes=8, dim=2):
+    """Scenes of random nodes and springs at rest, each its own: of all pairs, those that are absent have no stiffness."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(count, nodes, dim))
+    pairs = np.stack(np.triu_indices(nodes, 1), axis=1)
+    there = rng.random((count, len(pairs))) < 0.6
+    k, c = (np.where(there, rng.uniform(*span, there.shape), 0.0) for span in ((10, 1000), (0.1, 5)))
+    rest = np.linalg.norm(x[:, pairs[:, 0]] - x[:, pairs[:, 1]], axis=-1)
+    net = springs.Springs(pairs, k, rest, c if damped else None)
+    state = Particles(jnp.asarray(x), jnp.zeros_like(jnp.asarray(x)))
+    return Scene(state, mass=rng.uniform(0.1, 2, (count, nodes)), forces=(net,))
+
+
+def sheet(count, damping):
+    """NVIDIA's cloth at rest: 0.1 m and 0.1 kg for each node, k = 1000 N/m along all springs, two corners pinned."""
+    side, stiff = 0.1 * (count - 1), {"structural": 1e3, "shear": 1e3, "bend": 1e3, "damping": damping}
+    cloth = lattices.cloth(side, side, count, count, mass=0.1 * count**2, down=(0, 0, 1), **stiff)
+    return Scene(cloth.state, mass=0.1, forces=(cloth.springs,), pinned=cloth.nodes["top"] & cloth.nodes["corners"])
+
+
+def confirmed(scene, method, steps, within=0.02):
+    """The prediction, and whether runs just below it keep a deviation small and runs just above do not, scene by scene."""
+    predicted = stability.limit(scene, method)
+    around = np.stack([(1 - within) * predicted.each, (1 + within) * predicted.each])
+    below, above = stability.grows(scene, method, around, steps=steps)
+    return predicted, ~below, above
+
+
+# against measurement
+
+
+@ALL
+def test_the_lectures_oscillator_has_its_known_limits(method):
+    known = {"euler": 0.1 / 15, "semi_implicit_euler": 0.50976}
+    predicted = stability.limit(oscillator(b=0.1), method)
+    assert predicted.dt == pytest.approx(known.get(method.__name__, predicted.dt), rel=1e-4)
+    assert (predicted.cause, predicted.force) == ("stiffness", "Anchor")
+    measured = stability.measure_limit(oscillator(b=0.1), method, steps=300_000 if method is methods.euler else 20_000)
+    assert measured == pytest.approx(predicted.dt, rel=0.02)
+
+
+@ALL
+@pytest.mark.parametrize("b", [None, 3.0, 20.0], ids=["undamped", "damped", "overdamped"])
+def test_the_limit_of_an_oscillator_is_the_measured_one(method, b):
+    if b is None and not method.promises.stable_to:
+        pytest.skip("never stable: see the test of its growth")
+    predicted = stability.limit(oscillator(b=b), method)
+    assert stability.measure_limit(oscillator(b=b), method) == pytest.approx(predicted.dt, rel=0.02)
+    assert predicted.cause == ("damping" if b == 20.0 else "stiffness")
+
+
+@ALL
+def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
+    chain = SCENES["oscillator_chain"]().scene
+    predicted = stability.limit(chain, method)
+    omega = 2 * np.sqrt(400.0) * np.sin(50 * np.pi / 102)
+    assert predicted.dt == pytest.approx(method.promises.stable_to / omega, rel=1e-6)
+    if predicted.dt:
+        assert confirmed(chain, method, 2000)[1:] == (True, True)
+        assert predicted.spring in [(i, i + 1) for i in range(20, 32)]
+
+
+@pytest.mark.parametrize(
+    ("count", "damped"), [(8, True), *(pytest.param(200, damped, marks=pytest.mark.slow) for damped in (False, True))]
+)
+def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
+    scene = networks(count, damped, *((5, 2) if count == 8 else (8, 2)))
+    for name, method in METHODS.items():
+        if count == 8 and name not in {"euler" if damped else "verlet", "semi_implicit_euler"}:
+            continue
+        if not damped and not method.promises.stable_to:
+            assert not stability.limit(scene, method).each.any()
+            continue
+        steps = 4000 if name not in SLOW_TO_GROW else 8000 if count == 8 else 100_000
+        predicted, below, above = confirmed(scene, method, steps)
+        assert below.all(), name
+        # what grows by less than this all through the run is not seen in it
+        seen = steps / 2 * np.log(stability.growth(scene, method, 1.02 * predicted.each)) > np.log(1000)
+        assert above[seen].all(), name
+        assert seen.mean() > 0.9 or name in SLOW_TO_GROW
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["semi_implicit_euler", "rk4"])
+@pytest.mark.parametrize("damping", [None, 10.0], ids=["undamped", "damped"])
+def test_the_limit_of_a_cloth_of_a_thousand_nodes_is_the_measured_one(name, damping):
+    within = 0.02 if damping is None else 0.05
+    predicted, below, above = confirmed(sheet(32, damping), METHODS[name], 200, within)
+    assert (below, above) == (True, True)
+    known = {(None, "semi_implicit_euler"): 6.3e-3, (10.0, "semi_implicit_euler"): 1.8e-3}
+    assert predicted.dt == pytest.approx(known.get((damping, name), predicted.dt), rel=0.02)
+
+
+@pytest.mark.parametrize("damping", [pytest.param(None, marks=pytest.mark.slow), 10.0], ids=["undamped", "damped"])
+def test_what_sets_the_limit_of_a_cloth_is_its_stiffness_or_its_damping(damping):
+    cloth = sheet(12, damping)  # of so many coordinates only the fastest modes are sought
+    predicted = stability.limit(cloth, methods.semi_implicit_euler)
+    assert predicted.dt == pytest.approx(6.3e-3 if damping is None else 1.8e-3, rel=0.05)
+    assert (predicted.cause, predicted.force) == ("stiffness" if damping is None else "damping", "Springs")
+    if damping:
+        assert confirmed(cloth, methods.semi_implicit_euler, 200, within=0.05)[1:] == (True, True)
+
+
+@pytest.mark.parametrize("name", ["euler", "midpoint"])
+def test_a_method_without_a_stable_step_grows_as_predicted(name):
+    method, scene = METHODS[name], oscillator()
+    assert stability.limit(scene, method).dt == 0
+    for dt in (0.02, 0.05, 0.1):
+        predicted = stability.growth(scene, method, dt) - 1
+        omega_dt = np.sqrt(15.0) * dt
+        by_hand = np.sqrt(1 + omega_dt**2 if name == "euler" else 1 + omega_dt**4 / 4) - 1
+        assert predicted == pytest.approx(by_hand, rel=1e-6)
+        steps = int(min(40_000, 20 / predicted))
+        assert stability.measure_growth(scene, method, dt, steps=steps) - 1 == pytest.approx(predicted, rel=0.02)
+
+
+# the region
+
+
+@ALL
+def test_the_region_reaches_as_far_as_promised(method):
+    region = stability.region(method, real=(-0.5, 0.5), imaginary=(-4.0, 4.0), points=(3, 801))
+    axis = region.radius[:, 1]
+    stable = np.abs(region.z.imag[:, 1][axis <= 1 + 1e-9]).max()
+    assert stable == pytest.approx(method.promises.stable_to, abs=0.0101)
+
+
+def test_the_region_of_rk4_is_that_of_its_polynomial():
+    region = stability.region(methods.rk4)
+    z = region.z
+    polynomial = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24)
+    np.testing.assert_allclose(region.radius, polynomial, rtol=1e-6, atol=1e-7)
+
+
+# what is said
+
+
+def test_a_limit_reads_as_a_sentence():
+    assert str(stability.limit(oscillator(b=0.1), methods.euler)) == (
+        "euler: 6.67 ms, set by the stiffness of Anchor, λ = -0.05 ± 3.873i 1/s"
+    )
+    assert "no step is stable" in str(stability.limit(oscillator(), methods.euler))
+    free = Scene(Particles(jnp.ones(2), jnp.ones(2)), forces=(forces.Gravity(),))
+    assert stability.limit(free, methods.euler).dt == np.inf
+    assert "any step is stable" in str(stability.limit(free, methods.euler))
+
+
+def test_independent_lanes_have_a_limit_each():
+    scene = SCENES["oscillator"]().scene
+    predicted = stability.limit(scene, methods.verlet)
+    np.testing.assert_allclose(predicted.each, 2 / np.sqrt([1.0, 10.0, 100.0, 1000.0]), rtol=1e-5)
+    assert predicted.dt == predicted.each.min()
+    assert predicted.node == (3,)
+    np.testing.assert_allclose(stability.measure_limit(scene, methods.verlet), predicted.each, rtol=0.02)
+
+
+def test_the_stiff_spring_among_soft_ones_is_named():
+    x = jnp.arange(6.0)[:, None]
+    k = jnp.asarray([10.0, 10.0, 10.0, 500.0, 10.0])
+    row = springs.Springs(np.stack([np.arange(5), np.arange(1, 6)], axis=1), k, 1.0)
+    scene = Scene(Particles(x, jnp.zeros_like(x)), forces=(forces.independent(lambda t, s, m: -0.1 * s.velocity), row))
+    predicted = stability.limit(scene, methods.semi_implicit_euler)
+    assert (predicted.cause, predicted.force, predicted.spring) == ("stiffness", "Springs", (3, 4))
+    assert predicted.node in {(3,), (4,)}
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(TypeError, match="expected a Scene"):
+        stability.limit("cloth", methods.rk4)
+    with pytest.raises(TypeError, match=r"such as methods\.rk4"):
+        stability.limit(oscillator(), "rk4")
+    with pytest.raises(ValueError, match="expected the scene's"):
+        stability.limit(oscillator(), methods.rk4, at=Particles(jnp.ones(2), jnp.ones(2)))
+    with pytest.raises(ValueError, match="smaller step first"):
+        stability.measure_limit(oscillator(), methods.rk4, between=(1.0, 0.1))
