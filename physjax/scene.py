@@ -17,7 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, real_array, real_quantity
+from physjax.checks import demand_legal, real_array, real_quantity
 from physjax.lanes import WHOLE, kept_apart
 from physjax.vectors import scale
 
@@ -209,7 +209,7 @@ class Scene(eqx.Module):
         self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
         contacts = [_part("contact", contact, dtype) for contact in _listed("contact", contacts)]
         for contact in contacts:
-            _demand_legal(contact, state)
+            demand_legal(contact, state)
         self.contacts = tuple(contact.prepared(state, self.couples) for contact in contacts)
         self.pinned = pinned
         self.reaction = None
@@ -368,25 +368,6 @@ def _part(kind: str, part: Any, dtype: np.dtype) -> eqx.Module:
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf,
         part if isinstance(part, eqx.Module) else Function(part),
     )
-
-
-def _demand_legal(contact: Contact, state: Particles) -> None:
-    """Raise a ValueError naming the lanes that start on the wrong side of a contact by more than rounding."""
-    gap = concrete(contact.gap(jnp.zeros((), state.dtype), state.position))
-    if gap is None:
-        return
-    rounding = 8 * float(jnp.finfo(state.dtype).eps) * float(np.abs(np.asarray(state.position)).max())
-    if (gap < -rounding).any():
-        lanes = np.argwhere(gap < -rounding)
-        where = (
-            "the particle starts"
-            if not gap.ndim
-            else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
-        )
-        raise ValueError(
-            f"{type(contact).__name__}: {where} on the wrong side, {-gap.min():.3g} m deep; expected gaps >= 0. "
-            "Move them, or put them on the surface: state = contact.respond(0.0, state)."
-        )
 
 
 def _sum(terms: Any) -> Array:
