@@ -9,6 +9,7 @@ from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
 
 ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+BOUNDED = {name: method for name, method in METHODS.items() if np.isfinite(method.promises.stable_to)}
 SLOW_TO_GROW = {"euler", "midpoint"}
 
 
@@ -76,7 +77,7 @@ def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
     predicted = stability.limit(chain, method)
     omega = 2 * np.sqrt(400.0) * np.sin(50 * np.pi / 102)
     assert predicted.dt == pytest.approx(method.promises.stable_to / omega, rel=1e-6)
-    if predicted.dt:
+    if 0 < predicted.dt < np.inf:
         assert confirmed(chain, method, 2000)[1:] == (True, True)
         assert predicted.spring in [(i, i + 1) for i in range(20, 32)]
 
@@ -86,13 +87,13 @@ def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
 )
 def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
     scene = networks(count, damped, *((5, 2) if count == 8 else (8, 2)))
-    for name, method in METHODS.items():
+    for name, method in BOUNDED.items():
         if count == 8 and name not in {"euler" if damped else "verlet", "semi_implicit_euler"}:
             continue
         if not damped and not method.promises.stable_to:
             assert not stability.limit(scene, method).each.any()
             continue
-        steps = 4000 if name not in SLOW_TO_GROW else 8000 if count == 8 else 100_000
+        steps = 4000 if name not in SLOW_TO_GROW else 8000 if count == 8 else 20_000
         predicted, below, above = confirmed(scene, method, steps)
         assert below.all(), name
         # what grows by less than this all through the run is not seen in it
@@ -143,7 +144,7 @@ def test_the_region_reaches_as_far_as_promised(method):
     region = stability.region(method, real=(-0.5, 0.5), imaginary=(-4.0, 4.0), points=(3, 801))
     axis = region.radius[:, 1]
     stable = np.abs(region.z.imag[:, 1][axis <= 1 + 1e-9]).max()
-    assert stable == pytest.approx(method.promises.stable_to, abs=0.0101)
+    assert stable == pytest.approx(min(method.promises.stable_to, 4.0), abs=0.0101)
 
 
 def test_the_region_of_rk4_is_that_of_its_polynomial():
