@@ -91,7 +91,13 @@ class ImplicitEuler(eqx.Module):
         def tangent(g, y):
             return self._solve(step, g, y, self._floor(y), False)[0]
 
-        return lax.custom_root(residual, guess, lambda f, u: self._newton(step, f, u), tangent, has_aux=True)
+        def solve(f, u):
+            u, solved = self._newton(step, f, u)
+            # as floats: jax 0.10 differentiates what comes along, and numbers that count have no derivative
+            return u, [leaf.astype(u[0].dtype) for leaf in solved]
+
+        u, (relative, products, ok) = lax.custom_root(residual, guess, solve, tangent, has_aux=True)
+        return u, Solved(relative, products.astype(jnp.int32), ok > 0)
 
     def _newton(self, step: "_Step", residual: Callable, u: Vector) -> tuple[Vector, Solved]:
         zero = residual(step.nothing())

@@ -1,0 +1,265 @@
+"""Implicit Euler on a stiff cloth: what a frame costs, and what accuracy a second of computing buys beside explicit methods.
+
+    python benchmarks/implicit.py [--quick] [--out DIR]
+
+The cloth of T. Liu et al., "Fast simulation of mass-spring systems" (2013): 81 × 81 nodes, 1 m square, 1 kg, k = 1000 N/m
+structural and shear, 100 bend, two corners pinned, 60 frames a second, float32. (a) the first 90 frames one by one by
+implicit Euler at a relative residual of 1e-3; (b) the linear system of a frame by our conjugate gradients and by lineax's,
+to the same 2-norm; (c) error after a quarter of a second against time, for implicit Euler at 1/60 s and shorter, and
+explicit methods from their largest stable step down.
+All run on one core if the process may use one (taskset -c 0).
+"""
+
+import math
+import statistics
+import time
+from functools import partial
+from typing import Any, NamedTuple
+
+import harness
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import Bar, Missing, tell
+
+from physjax import Particles, Scene, forces, lattices, methods, simulate
+from physjax.files import replacing
+from physjax.stepping.implicit import ImplicitEuler
+from physjax.stepping.krylov import conjugate_gradients
+
+DT, LOOSE = 1 / 60, 1e-3
+GAMES = ImplicitEuler(tolerance=LOOSE)
+LIU = {"their fast solver": 50.0, "Newton": 13_000.0}
+"""What Liu et al. report for a frame [ms], on their machine."""
+COLOURS = {"implicit_euler": "#0072B2", "semi_implicit_euler": "#E69F00", "rk4": "#009E73"}
+
+
+class Settings(NamedTuple):
+    """Sizes of the runs."""
+
+    side: int
+    frames: int
+    horizon: int
+    refinements: int
+    repeats: int
+
+
+FULL = Settings(81, 90, 15, 5, 5)
+QUICK = Settings(17, 6, 3, 2, 1)
+
+
+def cloth(side: int, dtype: Any = np.float32) -> Scene:
+    """The cloth, with its weight."""
+    sheet = lattices.cloth(1.0, 1.0, side, side, mass=1.0, structural=1000.0, shear=1000.0, bend=100.0)
+    state = Particles(*(jnp.asarray(leaf, dtype) for leaf in sheet.state))
+    pinned = sheet.nodes["top"] & sheet.nodes["corners"]
+    return Scene(state, mass=sheet.mass, forces=(forces.Gravity(), sheet.springs), pinned=pinned)
+
+
+def frame_by_frame(scene: Scene, frames: int) -> tuple[list[float], list[int], list[float], Scene]:
+    """Seconds, products with the matrix and relative residual of each frame, each called by itself; the scene half way."""
+    step = partial(simulate, method=GAMES, dt=DT, steps=1)
+    jax.block_until_ready(step(scene).state)
+    seconds, products, residuals, middle = [], [], [], scene
+    for i in range(frames):
+        start = time.perf_counter()
+        after = jax.block_until_ready(step(scene, first_step=i).final_scene)
+        seconds.append(time.perf_counter() - start)
+        report = GAMES.report(scene, DT)
+        products.append(int(report.products))
+        residuals.append(float(report.residual))
+        scene = after
+        if i == frames // 6:
+            middle = scene
+    return seconds, products, residuals, middle
+
+
+def system(scene: Scene) -> tuple[Any, jax.Array]:
+    """The matrix of a linearised step, as a function, and its right-hand side; nodes are equally heavy."""
+    near = scene.near(DT, scene.state)
+    x, v = scene.state
+    a, push = jax.linearize(lambda x, v: near.acceleration(DT, Particles(x, v)), x, v)
+    return lambda u: u - DT * push(DT * u, u), DT * (a + push(DT * v, jnp.zeros_like(v)))
+
+
+def linear_contenders(scene: Scene) -> dict[str, Any]:
+    """The linear system of a step to the same residual, by ours and by lineax."""
+    lx = harness.optional("lineax")
+    inner = lambda a, b: jnp.sum(a[0] * b[0])  # noqa: E731
+
+    def solved(solve):
+        """The solution with its residual, found by the program that knows the matrix: rounding makes another one of it."""
+
+        @jax.jit
+        def run(scene):
+            matvec, b = system(scene)
+            u = solve(matvec, b)
+            r = b - matvec(u)
+            return u, jnp.sqrt(jnp.sum(r * r) / jnp.sum(b * b))
+
+        return partial(run, scene)
+
+    def ours(matvec, b):
+        return conjugate_gradients(lambda u: [matvec(u[0])], [b], inner, LOOSE, 1000)[0][0]
+
+    def lineax(matvec, b):
+        size = jnp.sqrt(jnp.sum(b * b))
+        operator = lx.FunctionLinearOperator(
+            matvec, jax.ShapeDtypeStruct(b.shape, b.dtype), lx.positive_semidefinite_tag
+        )
+        # its relative tolerance is meant entry by entry: an absolute one, and a right-hand side of norm 1
+        solver = lx.CG(rtol=0.0, atol=LOOSE, norm=lambda r: jnp.sqrt(jnp.sum(r * r)), max_steps=1000)
+        return size * lx.linear_solve(operator, b / size, solver, throw=False).value
+
+    return {"physjax, conjugate gradients": solved(ours), "lineax, CG": solved(lineax)}
+
+
+def race(contenders: dict[str, Any], goal: float, repeats: int) -> list[dict]:
+    """Milliseconds and residual of each contender; one that failed says why."""
+    rows, found = [], {}
+    timings, failed = harness.side_by_side(contenders, repeats, lambda name, run: found.update({name: float(run[1])}))
+    for name, timing in timings.items():
+        row = {"name": name, "ms": 1e3 * timing.least, "median_ms": 1e3 * timing.median, "residual": found[name]}
+        rows.append(row | {"converged": found[name] <= 1.5 * goal, "first_call_s": timing.first})
+    return rows + [{"name": name, "failed": why} for name, why in failed.items()]
+
+
+def largest_frequency(scene: Scene) -> float:
+    """ω of the fastest oscillation at rest [rad/s], by 300 rounds of the power method."""
+    x, v = scene.state
+
+    @jax.jit
+    def power(start):
+        _, push = jax.linearize(lambda x: scene.acceleration(0.0, Particles(x, v)), x)
+
+        def turn(_, carry):
+            y, _ = carry
+            z = -push(y)
+            size = jnp.sqrt(jnp.sum(z * z))
+            return z / size, size
+
+        return jax.lax.fori_loop(0, 300, turn, (start / jnp.sqrt(jnp.sum(start * start)), jnp.zeros((), x.dtype)))[1]
+
+    start = np.random.default_rng(0).normal(size=x.shape) * ~np.asarray(scene.pinned)[:, None]
+    return math.sqrt(float(power(jnp.asarray(start, x.dtype))))
+
+
+def truth(size: Settings, omega: float) -> np.ndarray:
+    """Positions at the horizon by rk4 in float64 at a quarter of its largest stable step."""
+    with jax.enable_x64(True):
+        scene = cloth(size.side, np.float64)
+        steps = size.horizon * math.ceil(DT * omega / 0.7)
+        return np.asarray(ended(scene, methods.rk4, steps, size))
+
+
+def ended(scene: Scene, method: Any, steps: int, size: Settings) -> jax.Array:
+    """Positions at the horizon after so many steps."""
+    run = simulate(scene, method, dt=size.horizon * DT / steps, steps=steps, save_every=steps)
+    return run.final_scene.state.position
+
+
+def work_and_error(scene: Scene, size: Settings, omega: float) -> list[dict]:
+    """Error after the horizon and time of a frame, for each method from its longest useful step down."""
+    exact = truth(size, omega)
+    coarsest = {
+        "implicit_euler": 1,
+        "semi_implicit_euler": math.ceil(DT * omega / 1.9),
+        "rk4": math.ceil(DT * omega / 2.7),
+    }
+    rows = []
+    for name, fewest in coarsest.items():
+        method = GAMES if name == "implicit_euler" else getattr(methods, name)
+        for n in [fewest * 2**i for i in range(size.refinements if name == "implicit_euler" else 3)]:
+            run = partial(ended, scene, method, n * size.horizon, size)
+            error = float(np.sqrt(np.mean((np.asarray(run(), float) - exact) ** 2)))
+            ms = 1e3 * min(harness.stopwatch(run) for _ in range(size.repeats)) / size.horizon
+            rows.append({"method": name, "steps_a_frame": n, "error": error, "ms": ms})
+            tell(f"  {name}, {n} steps a frame: {ms:.2f} ms a frame, error {error:.2e} m")
+    return rows
+
+
+def draw(path: Any, seconds: list[float], rows: list[dict], size: Settings, foot: str) -> None:
+    """Frames by their time, and error against time."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    ms = 1e3 * np.asarray(seconds)
+    left.plot(
+        np.arange(1, len(ms) + 1), ms, color=COLOURS["implicit_euler"], label="implicit_euler at 1/60 s, residual 1e-3"
+    )
+    left.axhline(np.median(ms), color="black", linewidth=0.8, linestyle="--", label=f"median {np.median(ms):.1f} ms")
+    left.set(
+        xlabel="frame", ylabel="time of a frame [ms]", ylim=(0, None), title=f"{size.side} × {size.side} cloth, float32"
+    )
+    left.legend(frameon=False)
+    for name, colour in COLOURS.items():
+        points = [(row["ms"], row["error"], row["steps_a_frame"]) for row in rows if row["method"] == name]
+        points = [point for point in points if math.isfinite(point[1])]
+        right.loglog(*zip(*[p[:2] for p in points], strict=True), "o-", color=colour, label=name)
+        for x, y, n in points:
+            right.annotate(f"{n}", (x, y), textcoords="offset points", xytext=(5, 5), fontsize=8, color=colour)
+    right.set(xlabel="time of a frame [ms]", ylabel=f"rms error of position after {size.horizon * DT:.3g} s [m]")
+    right.set_title("error against time; numbers: steps a frame")
+    right.grid(alpha=0.3)
+    right.legend(frameon=False)
+    figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
+    with replacing(path, "wb") as file:
+        figure.savefig(file, format="png", dpi=150)
+
+
+def main() -> None:
+    """Run all studies, print their tables, write the record and the chart."""
+    quick, folder = harness.options(__doc__)
+    size, about = QUICK if quick else FULL, harness.machine()
+    tell(harness.caption(about))
+    scene = cloth(size.side)
+    tell("frames")
+    seconds, products, residuals, middle = frame_by_frame(scene, size.frames)
+    tell("linear system")
+    races, missing = {}, {}
+    try:
+        races["linear system"] = race(linear_contenders(middle), LOOSE, size.repeats)
+    except Missing as reason:
+        missing["lineax"] = str(reason)
+    tell("error against time")
+    omega = largest_frequency(scene)
+    rows = work_and_error(scene, size, omega)
+
+    median = 1e3 * statistics.median(seconds)
+    allowed = 75.0 if jax.__version_info__ < (0, 11) else 50.0
+    bars = [
+        Bar("median of the frames [ms]", median, "<=", allowed),
+        Bar("largest relative residual of a frame", max(residuals), "<=", LOOSE),
+    ]
+    for name, entries in races.items():
+        ours, *others = entries
+        if not ours["converged"]:
+            raise SystemExit(f"physjax did not converge: {ours}")
+        good = [other for other in others if other.get("converged")]
+        bars += [Bar(f"{name}, {other['name']} / ours [times]", other["ms"] / ours["ms"], ">=", 1.3) for other in good]
+
+    print(harness.caption(about))
+    print(f"frames: median {median:.1f} ms, {statistics.median(products)} products; Liu et al. report {LIU} ms")
+    for name, entries in races.items():
+        cells = [[e["name"], e["ms"], e["median_ms"], e["residual"], e["first_call_s"]] for e in entries if "ms" in e]
+        harness.print_table(name, ["", "best [ms]", "median [ms]", "residual", "first call [s]"], cells)
+    cells = [[row["method"], row["steps_a_frame"], row["ms"], row["error"]] for row in rows]
+    harness.print_table(
+        f"error against time, ω = {omega:.0f} rad/s", ["", "steps a frame", "ms a frame", "error [m]"], cells
+    )
+    harness.print_bars(bars, quick)
+    for name, reason in missing.items():
+        print(f"left out: {name}, {reason}")
+    record = {"benchmark": "implicit", "quick": quick, "machine": about, "settings": size._asdict(), "reported_ms": LIU}
+    record |= {"seconds": seconds, "products": products, "residuals": residuals, "races": races, "left_out": missing}
+    record |= {"largest_frequency": omega, "error_against_time": rows}
+    record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
+    written, drawn = (harness.result_path(folder, "implicit", quick, ending) for ending in ("json", "png"))
+    harness.write_json(written, record)
+    draw(drawn, seconds, rows, size, harness.caption(about))
+    print(f"\nwritten: {written} and {drawn.name}")
+
+
+if __name__ == "__main__":
+    main()
