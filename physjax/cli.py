@@ -92,7 +92,13 @@ def _stability(name: str, out: str, steps: int) -> None:
         finite = np.isfinite(predicted.dt) and predicted.dt > 0
         measured = float(stability.measure_limit(scene, method, steps=steps).min()) if finite else None
         limits += [predicted.dt] if finite else []
-        rows.append([predicted.method, *_limit_texts(predicted.dt, measured), str(predicted).partition(", ")[2]])
+        rows.append(
+            [
+                predicted.method,
+                *_limit_texts(predicted.dt, measured),
+                str(predicted).partition(", ")[2] or "any step is stable",
+            ]
+        )
     print(f"\n{table(['method', 'predicted', 'measured', 'what sets it'], rows, align='<>><')}\n")
     if limits:
         chart = stability.map(scene, list(METHODS.values()), np.geomspace(min(limits) / 10, 3 * max(limits), 48))

@@ -32,19 +32,20 @@ class ImplicitEuler(eqx.Module):
     (`newton` = 0); `newton` > 0 converges the full equation in at most so many steps of Newton's method. Independent
     lanes solve a small system each, coupled scenes one for each scene by at most `iterations` products with its matrix:
     conjugate gradients where every force always pushes back (springs do, by their `near`), BiCGSTAB otherwise.
-    `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass. A solve that does not
-    converge raises nothing: `report` says so, with its residual. Derivatives go through the solution, not the
-    iterations. Raises ValueError or TypeError for bad settings.
+    `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass: √ε of the float type by
+    default. A solve that does not converge raises nothing: `report` says so, with its residual. Derivatives go through
+    the solution, not the iterations. Raises ValueError or TypeError for bad settings.
     """
 
-    tolerance: float = eqx.field(static=True, default=1e-8)
+    tolerance: float | None = eqx.field(static=True, default=None)
     iterations: int = eqx.field(static=True, default=1000)
     newton: int = eqx.field(static=True, default=0)
 
     promises = Promises(order=1, evaluations=1, stable_to=float("inf"), order_with_drag=1)
 
     def __check_init__(self):
-        if not isinstance(self.tolerance, int | float) or not 0 < self.tolerance < 1:
+        given = 0.5 if self.tolerance is None else self.tolerance
+        if not isinstance(given, int | float) or not 0 < given < 1:
             raise ValueError(
                 f"ImplicitEuler: got tolerance={self.tolerance!r}, expected a number between 0 and 1: the relative residual."
             )
@@ -122,7 +123,8 @@ class ImplicitEuler(eqx.Module):
 
     def _floor(self, b: Vector) -> float:
         """The tolerance, or what rounding leaves of it."""
-        return max(self.tolerance, 4 * float(jnp.finfo(b[0].dtype).eps))
+        eps = float(jnp.finfo(b[0].dtype).eps)
+        return eps**0.5 if self.tolerance is None else max(self.tolerance, 4 * eps)
 
     def _solve(
         self, step: "_Step", matvec: Callable, b: Vector, tolerance: float, definite: bool

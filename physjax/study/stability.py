@@ -63,10 +63,11 @@ class Limit(NamedTuple):
     def __str__(self) -> str:
         if self.cause == "nothing":
             return f"{self.method}: any step is stable, nothing swings or decays"
-        reach = "no step is stable" if self.dt == 0 else "any step is stable" if np.isinf(self.dt) else ""
+        if np.isinf(self.dt):
+            return f"{self.method}: any step is stable"
         where = "" if self.spring is None else f" (the spring between nodes {self.spring[0]} and {self.spring[1]})"
         what = f"set by the {self.cause} of {self.force}{where}, λ = {rate_text(self.rate)} 1/s"
-        return f"{self.method}: {reach or seconds_text(self.dt)}, {what}"
+        return f"{self.method}: {seconds_text(self.dt) if self.dt else 'no step is stable'}, {what}"
 
 
 def region(
