@@ -29,6 +29,13 @@ class Precision(NamedTuple):
     eps: float
 
 
+@pytest.fixture(autouse=True, scope="module")
+def compiled_programs():
+    """Forgotten after each file: Linux gives a process 65 530 mappings, and thousands of programs fill them."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(params=["float64", "float32"])
 def precision(request):
     with jax.enable_x64(request.param == "float64"):

@@ -128,6 +128,7 @@ def bounced(numbers):
     return simulate(scene, methods.rk4, dt=0.02, steps=108, save_every=36).position[1:]
 
 
+@pytest.mark.slow
 def test_derivatives_through_one_two_and_three_bounces():
     rng = np.random.default_rng(1)
     lanes = 1000
@@ -250,6 +251,7 @@ def test_a_ball_comes_to_rest_in_a_wedge():
     assert 0.5 < min(rests) <= max(rests) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opening", [30.0, 60.0, 90.0, 150.0])
 def test_a_block_slides_down_a_groove(opening):
     """Two planes carry it, each with N = m g cosα/(2 sin(opening/2)), so that a = g (sinα - μ_k cosα/sin(opening/2))."""
@@ -291,6 +293,7 @@ def test_a_lift_carries_what_rests_on_it_and_lets_go_of_what_is_pulled_off():
 # nothing passes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.05, 0.5])
 def test_ten_thousand_balls_stay_in_their_room(precision, dt):
     rng = np.random.default_rng(0)
@@ -345,6 +348,7 @@ def test_a_ball_between_two_pistons_is_heated():
 # batches
 
 
+@pytest.mark.slow
 def test_alone_in_lanes_in_a_large_batch_and_under_vmap_agree():
     heights = jnp.linspace(0.2, 2.0, 3000)
     run = lambda h: last(dropped(h, (1.0, 0.0), restitution=0.8), methods.verlet, dt=0.01, steps=150).state.position  # noqa: E731

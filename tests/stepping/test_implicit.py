@@ -87,6 +87,7 @@ def test_the_linearised_step_solves_the_equation_of_baraff_and_witkin():
     np.testing.assert_allclose(after.position, x + dt * (v + dv), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_converged_cloth_solves_the_whole_equation():
     scene = crumpled(hung(24), 1e-3)
     (x, v), report = scene.state, CONVERGED.report(scene, DT)
@@ -280,6 +281,7 @@ def demand_derivatives(start, method, modes):
         np.testing.assert_allclose(mode(measure)(at), central, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_gradient_through_a_cloth_agrees_with_central_differences():
     demand_derivatives(crumpled(hung(24), 2e-3), ImplicitEuler(tolerance=1e-13), [jax.grad])
 
