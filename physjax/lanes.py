@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool
 
 FEWEST = 1024
 """Scenes with fewer lanes are not worth picking lanes from."""
-SHARE = 64
+SHARE = 32
 """One lane in so many is room enough for the lanes that are picked at once."""
 
 
