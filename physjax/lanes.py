@@ -19,8 +19,6 @@ FEWEST = 1024
 """Scenes with fewer lanes are not worth picking lanes from."""
 SHARE = 32
 """One lane in so many is room enough for the lanes that are picked at once."""
-
-
 WHOLE = 64
 """Scenes with no more coupled nodes are compiled as one piece, which for few nodes runs faster."""
 
@@ -96,7 +94,7 @@ def on_flagged(function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *
 def _census(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
     """The flags as words of 32 bits, and how many are set up to and in each word: bit b of word w is lane b·words + w."""
     length = math.ceil(flag.size / 32)
-    bits = jnp.zeros(32 * length, bool).at[: flag.size].set(flag).reshape(32, length).astype(jnp.uint32)
+    bits = jnp.pad(flag, (0, 32 * length - flag.size)).reshape(32, length).astype(jnp.uint32)
     words = bits[0]
     for place in range(1, 32):
         words = words | (bits[place] << place)
@@ -120,14 +118,14 @@ def _picked(words: Array, upto: Array, number: Array) -> Array:
 
 def loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
     """`lax.while_loop(going, body, start)`, at most so many times, which compiles in pieces where the lanes are few."""
-    in_pieces = max(leaf.size for leaf in jax.tree.leaves(start)) < FEWEST
+    few = jax.default_backend() == "cpu" and max(leaf.size for leaf in jax.tree.leaves(start)) < FEWEST
 
     def again(state):
         return going(state[0]) & (state[1][0] < most)
 
     def once(state):
         carry, count = state
-        return body(carry), lax.sort(count + 1) if in_pieces else count + 1
+        return body(carry), lax.sort(count + 1) if few else count + 1
 
     return lax.while_loop(again, once, (start, jnp.arange(2, dtype=jnp.int32)))[0]
 

@@ -15,7 +15,7 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from physjax.lanes import any_lane
-from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, stabilised_biconjugate_gradients
+from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, solved, stabilised_biconjugate_gradients
 from physjax.stepping.registry import Promises
 from physjax.vectors import scale
 
@@ -68,10 +68,10 @@ class ImplicitEuler(eqx.Module):
 
     def _step(self, system, t, state, dt):
         step = _Step.of(system, t, state, dt)
-        u, solved = self._linearised(step)
+        u, told = self._linearised(step)
         if self.newton:
-            u, solved = self._converged(step, lax.stop_gradient(u))
-        return step.ended(u), solved
+            u, told = self._converged(step, lax.stop_gradient(u))
+        return step.ended(u), told
 
     def _linearised(self, step: "_Step") -> tuple[Vector, Solved]:
         """u from the equation linearised at the start of the step."""
@@ -93,9 +93,9 @@ class ImplicitEuler(eqx.Module):
             return self._solve(step, g, y, self._floor(y), False)[0]
 
         def solve(f, u):
-            u, solved = self._newton(step, f, u)
+            u, told = self._newton(step, f, u)
             # as floats: jax 0.10 differentiates what comes along, and numbers that count have no derivative
-            return u, [leaf.astype(u[0].dtype) for leaf in solved]
+            return u, [leaf.astype(u[0].dtype) for leaf in told]
 
         u, (relative, products, ok) = lax.custom_root(residual, guess, solve, tangent, has_aux=True)
         return u, Solved(relative, products.astype(jnp.int32), ok > 0)
@@ -108,18 +108,16 @@ class ImplicitEuler(eqx.Module):
         def body(carry):
             u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
-            change, solved = self._solve(step, tangent, r, FORCING, False)
+            change, told = self._solve(step, tangent, r, FORCING, False)
             u, after = _searched(step, residual, u, change, square, going)
-            count = count + jnp.where(going, solved.products, 0)
+            count = count + jnp.where(going, told.products, 0)
             return u, after, going & (after > goal) & (after < square), count, i + 1
 
         r = residual(u)
         square = step.inner(r, r)
         start = (u, square, square > goal, jnp.zeros(size.shape, jnp.int32), jnp.zeros((), jnp.int32))
         u, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[2]) & (c[-1] < self.newton), body, start)
-        present = size > 0
-        relative = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))
-        return u, Solved(relative, count, square <= goal)
+        return u, solved(square, size, goal, count)
 
     def _floor(self, b: Vector) -> float:
         """The tolerance, or what rounding leaves of it."""
@@ -132,8 +130,9 @@ class ImplicitEuler(eqx.Module):
         """matvec(u) = b: in closed form where lanes stand alone, else iteratively."""
         if step.alone and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED:
             u = _lane_by_lane(matvec, b[0])
-            r = _minus(b, matvec([u]))
-            return [u], _direct(step, r, b, tolerance)
+            r, size = _minus(b, matvec([u])), step.inner(b, b)
+            products = jnp.full(size.shape, b[0].shape[-1], jnp.int32)
+            return [u], solved(step.inner(r, r), size, tolerance**2 * size, products)
         iterate = conjugate_gradients if definite else stabilised_biconjugate_gradients
 
         def solve(matvec, b):
@@ -284,13 +283,6 @@ def _cramer_3(columns, b):
 
 
 _CLOSED = {1: _cramer_1, 2: _cramer_2, 3: _cramer_3}
-
-
-def _direct(step: _Step, r: Vector, b: Vector, tolerance: float) -> Solved:
-    size, square = step.inner(b, b), step.inner(r, r)
-    present = size > 0
-    relative = jnp.sqrt(square / jnp.where(present, size, 1.0))
-    return Solved(relative, jnp.full(size.shape, b[0].shape[-1], jnp.int32), relative <= tolerance)
 
 
 @jax.jit

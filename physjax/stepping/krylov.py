@@ -50,7 +50,7 @@ def conjugate_gradients(
     none = jnp.zeros(size.shape, jnp.int32)
     start = ([jnp.zeros_like(e) for e in b], b, b, size, size > goal, none, jnp.zeros((), jnp.int32))
     x, _, _, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[4]) & (c[-1] < most), body, start)
-    return x, _solved(square, size, goal, count)
+    return x, solved(square, size, goal, count)
 
 
 def stabilised_biconjugate_gradients(
@@ -79,7 +79,7 @@ def stabilised_biconjugate_gradients(
     none = jnp.zeros(size.shape, jnp.int32)
     start = ([jnp.zeros_like(e) for e in b], b, b, size, size, size > goal, none, jnp.zeros((), jnp.int32))
     x, _, _, _, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[5]) & (c[-1] < most), body, start)
-    return x, _solved(square, size, goal, count)
+    return x, solved(square, size, goal, count)
 
 
 def _plus(x: Vector, number: Array, y: Vector) -> Vector:
@@ -93,7 +93,8 @@ def _ratio(above: Array, below: Array, going: Array) -> Array:
     return jnp.where(good, above, 0.0) / jnp.where(good, below, 1.0)
 
 
-def _solved(square: Array, size: Array, goal: Array, count: Array) -> Solved:
+def solved(square: Array, size: Array, goal: Array, count: Array) -> Solved:
+    """The report on a solve whose residual has the square `square`, of a right-hand side with the square `size`."""
     present = size > 0
     residual = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))
     return Solved(residual, count, square <= goal)

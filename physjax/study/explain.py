@@ -12,6 +12,7 @@ from physjax.show.report import seconds_text
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
+from physjax.study.limits import Limit, growth, limit
 from physjax.study.small_motion import rate_text
 from physjax.trajectory import Trajectory
 
@@ -61,10 +62,13 @@ class Explanation(NamedTuple):
         return " ".join([ended, why, *(f"Cure: {cure}." for cure in self.cures)])
 
 
-def explained(
-    run: Trajectory | Scene, method: Callable | None, dt: float | None, steps: int, limit: Callable, growth: Callable
+def explain(
+    run: Trajectory | Scene, method: Callable | None = None, dt: float | None = None, *, steps: int = 1200
 ) -> Explanation:
-    """See `stability.explain`."""
+    """Why a run blew up or went astray: where, the force and the eigenvalue responsible, the limit broken, two cures.
+
+    Give a trajectory, or a scene with a method and a dt [s], which is then run for `steps`. Print the result.
+    """
     if isinstance(run, Scene):
         if method is None or dt is None:
             raise ValueError("explain: got a scene alone, expected its method and dt as well.")
@@ -92,7 +96,7 @@ def explained(
         grown = float(np.max(growth(scene, method, step, at=state)))
         return Explanation(
             worst.cause, worst.force, worst.spring, worst.rate, t, limit=worst.dt, growth=grown, **told,
-            cures=_cures(scene, method, step, worst, state, limit),
+            cures=_cures(scene, method, step, worst, state),
         )  # fmt: skip
     t, fastest, _ = max(found, key=lambda moment: abs(moment[1].rate))
     if abs(fastest.rate) * step > RESOLVED:
@@ -142,7 +146,7 @@ def _moments(run: Trajectory, scene: Scene) -> Any:
             yield float(np.min(np.asarray(run.time[i]))), state
 
 
-def _cures(scene: Scene, method: Any, dt: float, worst: Any, state: Particles, limit: Callable) -> tuple[str, ...]:
+def _cures(scene: Scene, method: Any, dt: float, worst: Limit, state: Particles) -> tuple[str, ...]:
     """A shorter step of the same method, and the method that needs the fewest evaluations."""
     cures = []
     promised = getattr(method, "promises", None)

@@ -12,6 +12,7 @@ from physjax.scene import Scene, as_module
 from physjax.stepping import methods as ours
 from physjax.stepping.reference import in_dtype
 from physjax.stepping.simulate import sample
+from physjax.study.limits import checked_method, limit, name_of
 
 FRAMES = 4
 """Moments at which a run is compared with the truth; every dt is rounded so that they are whole steps."""
@@ -42,15 +43,22 @@ class StabilityMap(NamedTuple):
         return stability_map(self, figure)
 
 
-def run_map(
+def map(
     scene: Scene | Callable[[float], Scene],
     methods: Sequence[Callable],
     dts: Any,
-    parameter: tuple[str, Any] | None,
-    duration: float | None,
-    limit: Callable,
+    parameter: tuple[str, Any] | None = None,
+    *,
+    duration: float | None = None,
 ) -> StabilityMap:
-    """Judge every run; see `stability.map`."""
+    """Run a scene under every method and dt [s], call each run stable, inaccurate or diverged, and predict the boundary.
+
+    With a `parameter` (name, values), `scene` is a function of such a value. Judged by the positions after `duration`
+    [s] and on the way (forty of the longest steps, if not given): inaccurate is an error of more than 5 % of the way
+    gone, diverged one of more than ten times that way. Each dt is rounded to divide a quarter of the duration.
+    """
+    for method in methods:
+        checked_method(method)
     dts = np.sort(np.asarray(real_quantity("dts [s]", dts, above=0.0), float).ravel())
     name, values = ("", [0.0]) if parameter is None else parameter
     values = np.asarray(real_quantity(f"values of {name}", values), float).ravel()
@@ -63,7 +71,7 @@ def run_map(
         scenes = [in_dtype(scene(value) if parameter else scene, jnp.float64) for value in values]
         predicted = np.array([[limit(s, method).dt for s in scenes] for method in methods])
         counts = np.maximum(1, np.round(duration / FRAMES / dts)).astype(int)
-        truths = [_positions(s, ours.rk4, duration, _fine(s, counts, duration, limit)) for s in scenes]
+        truths = [_positions(s, ours.rk4, duration, _fine(s, counts, duration)) for s in scenes]
         error = np.array(
             [
                 [
@@ -75,11 +83,11 @@ def run_map(
         )
     verdict = np.where(error <= INACCURATE, 0, np.where(error <= DIVERGED, 1, 2))
     actual = np.broadcast_to(duration / FRAMES / counts, error.shape)
-    names = tuple(getattr(method, "__name__", type(method).__name__) for method in methods)
+    names = tuple(name_of(method) for method in methods)
     return StabilityMap(names, name, values, actual, verdict, error, predicted, duration)
 
 
-def _fine(scene: Scene, counts: np.ndarray, duration: float, limit: Callable) -> int:
+def _fine(scene: Scene, counts: np.ndarray, duration: float) -> int:
     """Steps of rk4 in a frame for the truth: finer than any run, and a tenth of what is stable."""
     stable = limit(scene, ours.rk4).dt
     return int(max(2 * counts.max(), np.ceil(10 * duration / FRAMES / stable) if 0 < stable < np.inf else 0))

@@ -33,24 +33,62 @@ def test_kepler_takes_a_third_of_the_evaluations_of_fixed_steps():
     assert 3 * (3 * 4 * tries + 2 * frames) <= 4 * fixed
 
 
-@pytest.mark.parametrize("name", ["kepler", "oscillator"])
-@pytest.mark.parametrize("method", [methods.euler, methods.verlet, methods.rk4], ids=lambda m: m.__name__)
-def test_the_local_error_of_accepted_steps_stays_within_twice_the_tolerance(name, method):
-    problem, frames, tolerance = SCENES[name](), 100, 1e-6
-    scene, dt = problem.scene, problem.duration / 8000
-    chooser = methods.adaptive(method, tolerance, tolerance)
-    counts = methods.count_steps(scene, chooser, dt=dt, steps=frames)
-    states = jax.tree.map(lambda start, ends: jnp.concatenate([start[None], ends]), scene.state, counts.state)
+# the gallery's scenes without contacts, and into how many parts a run is cut so that the first is a few dozen steps
+SMOOTH = {"projectile": 10, "fall_with_drag": 40, "raindrop": 2000, "kepler": 800, "figure_eight": 80}
+SMOOTH |= {"solar_system": 4000, "oscillator": 800, "oscillator_chain": 800, "hanging_rope": 10000}
+SMOOTH |= {"hanging_cloth": 1000, "flag": 800}
+SLOW = {"hanging_rope", "hanging_cloth", "flag"}
 
-    def fine(state):
-        step = lambda i, s: methods.rk4(scene, 0.0, s, dt / 64)  # noqa: E731
-        return jax.lax.fori_loop(0, 64, step, state)
 
-    truth = jax.jit(jax.vmap(fine))(jax.tree.map(lambda leaf: leaf[:-1], states))
-    accepted = np.asarray(counts.accepted, float)
-    taken = accepted.reshape(accepted.shape + (1,) * (states.position.ndim - accepted.ndim))
-    for got, right in zip(*(map(np.asarray, s) for s in (states, truth)), strict=True):
-        assert np.all(np.abs(got[1:] - right) <= 2 * taken * tolerance * (1 + np.abs(right)))
+def accepted_steps(problem, chooser, duration):
+    """Start, length and end of each accepted step and its lanes, seen by running the method without compiling it."""
+    tried = []
+
+    def spy(system, t, state, dt):
+        end = chooser.method(system, t, state, dt)
+        tried.append((t, state, dt, end))
+        return end
+
+    watched = methods.adaptive(spy, chooser.atol, chooser.rtol, order=chooser.order)
+    with jax.disable_jit():
+        final = watched.report(problem.scene, jnp.zeros(()), problem.scene.state, duration).state
+    wholes, halves = tried[::3], tried[2::3]
+    for (t, start, dt, _), (*_, end), kept in zip(wholes, halves, [w[1] for w in wholes[1:]] + [final], strict=True):
+        accepted = jnp.all(kept.position == end.position, axis=-1) & jnp.any(kept.position != start.position, axis=-1)
+        yield t, start, dt, end, accepted
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in SMOOTH])
+def test_the_local_error_of_accepted_steps_stays_within_twice_the_tolerance(name):
+    problem = SCENES[name]()
+    assert problem.is_ode
+
+    @jax.jit
+    def fine(t, state, dt):
+        step = lambda i, state: methods.rk4(problem.scene, t + i * dt / 32, state, dt / 32)  # noqa: E731
+        return jax.lax.fori_loop(0, 32, step, state)
+
+    for method, tolerance in ((methods.euler, 1e-4), (methods.verlet, 1e-5), (methods.rk4, 1e-5)):
+        chooser = methods.adaptive(method, tolerance, tolerance)
+        worst = 0.0
+        for t, start, dt, end, accepted in accepted_steps(problem, chooser, problem.duration / SMOOTH[name]):
+            truth = fine(t, start, dt)
+            for got, right, was in zip(end, truth, start, strict=True):
+                allowed = tolerance * (1 + jnp.maximum(jnp.abs(was), jnp.abs(got)))
+                worst = max(worst, float(jnp.max(jnp.where(accepted[..., None], jnp.abs(got - right) / allowed, 0.0))))
+        # a method that is exact here makes no error at all
+        assert worst <= 2
+        assert worst > 1e-3 or name == "projectile" or method is methods.rk4
+
+
+@pytest.mark.parametrize("name", [name for name in SMOOTH if name not in SLOW])
+def test_at_most_one_try_in_twenty_is_rejected(name):
+    problem = SCENES[name]()
+    for method, tolerance in ((methods.euler, 1e-4), (methods.verlet, 1e-4), (methods.rk4, 1e-4), (methods.rk4, 1e-6)):
+        chooser = methods.adaptive(method, tolerance, tolerance)
+        counts = methods.count_steps(problem.scene, chooser, dt=problem.duration / 4, steps=4)
+        accepted, rejected = int(jnp.sum(counts.accepted)), int(jnp.sum(counts.rejected))
+        assert rejected <= 0.05 * (accepted + rejected), (method.__name__, tolerance, accepted, rejected)
 
 
 def test_it_lands_on_the_end_and_lanes_have_steps_of_their_own():
