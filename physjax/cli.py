@@ -5,8 +5,12 @@ import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
+
+MOMENTS = 16
+"""Moments of a run at which its small motions are looked at."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scenes.set_defaults(run=lambda options: _scenes())
 
     stability = commands.add_parser("stability", help="which step is stable in a scene: predicted and measured limits")
-    stability.add_argument("scene", metavar="SCENE", help="a name from `physjax scenes`")
+    stability.add_argument("scene", metavar="SCENE", help="a name from `physjax scenes`, failures included")
     stability.add_argument("--out", default="stability", metavar="DIR", help="where the map goes (default: stability)")
     stability.add_argument("--steps", type=int, default=4000, help="steps of a measuring run (default: 4000)")
     stability.set_defaults(run=lambda options: _stability(options.scene, options.out, options.steps))
@@ -41,11 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _scenes() -> None:
-    """Print every scene with its one-line description."""
-    from physjax.scenes import SCENES, title
+    """Print every scene, and every run that must fail, with its one-line description."""
+    from physjax.scenes import FAILURES, SCENES, title
     from physjax.show.report import table
 
-    print(table(["scene", "what it is"], [[name, title(name)] for name in SCENES], align="<<"))
+    for header, names in (("scene", SCENES), ("failure", FAILURES)):
+        print(table([header, "what it is"], [[name, title(name)] for name in names], align="<<"), end="\n\n")
 
 
 def _chart(names: list[str], out: str, quick: bool) -> None:
@@ -76,21 +81,27 @@ def _stability(name: str, out: str, steps: int) -> None:
 
     from physjax.checks import known, positive_integer
     from physjax.files import replacing, writable_folder
-    from physjax.scenes import SCENES
-    from physjax.show.report import machine, table
+    from physjax.scenes import FAILURES, SCENES
+    from physjax.show.report import machine, seconds_text, table
     from physjax.stepping.methods import METHODS
     from physjax.study import stability
+    from physjax.study.limits import name_of
 
-    name, steps = known("scene", name, SCENES), positive_integer("steps", steps, at_least=64)
+    name, steps = known("scene", name, SCENES | FAILURES), positive_integer("steps", steps, at_least=64)
     folder = writable_folder(out)
     matplotlib.use("Agg")
     with jax.enable_x64(True):
-        scene = SCENES[name]().scene
+        problem = (SCENES | FAILURES)[name]()
+    scene = problem.scene
+    time, at = _fastest_moment(problem) if name in SCENES else (0.0, scene.state)
+    unstable = bool(stability.grows_by_itself(scene, at).any())
     rows, limits = [], []
     for method in tqdm(METHODS.values(), desc=name, unit="method", file=sys.stderr):
-        predicted = stability.limit(scene, method)
+        predicted = stability.limit(scene, method, at)
         finite = np.isfinite(predicted.dt) and predicted.dt > 0
-        measured = float(stability.measure_limit(scene, method, steps=steps).min()) if finite else None
+        measured = (
+            float(stability.measure_limit(scene, method, at, steps=steps).min()) if finite and not unstable else None
+        )
         limits += [predicted.dt] if finite else []
         rows.append(
             [
@@ -100,6 +111,9 @@ def _stability(name: str, out: str, steps: int) -> None:
             ]
         )
     print(f"\n{table(['method', 'predicted', 'measured', 'what sets it'], rows, align='<>><')}\n")
+    print(f"About the state at t = {time:.4g} s, where the scene is fastest.")
+    if unstable:
+        print("There its own motion takes neighbours apart, whatever the method: nothing to be measured.")
     if limits:
         chart = stability.map(scene, list(METHODS.values()), np.geomspace(min(limits) / 10, 3 * max(limits), 48))
         with replacing(folder / f"{name}.png", "wb") as file:
@@ -107,15 +121,36 @@ def _stability(name: str, out: str, steps: int) -> None:
         print(f"Map: {folder / f'{name}.png'}")
     else:
         print("No method has a limit here, so there is no map to draw.")
+    if name in FAILURES:
+        told = stability.explain(scene, problem.method, problem.dt, steps=problem.steps)
+        print(f"{name_of(problem.method)} with dt = {seconds_text(problem.dt)}: {told}")
     print(f"Measured on {machine()}.")
+
+
+def _fastest_moment(problem: Any) -> tuple[float, Any]:
+    """The moment [s] of a run, of a few, at which small motions are fastest, and the state then."""
+    import jax
+    import numpy as np
+
+    from physjax.study.small_motion import about, small_motion
+
+    flight = problem.reference()
+
+    def pace(i: int) -> float:
+        with jax.enable_x64(True):
+            return float(np.abs(small_motion(*about(problem.scene, state(i))).rates()).max())
+
+    state = lambda i: jax.tree.map(lambda leaf: leaf[i], flight.state)  # noqa: E731
+    fastest = max(range(0, len(flight.time), max(1, len(flight.time) // MOMENTS)), key=pace)
+    return float(flight.time[fastest]), state(fastest)
 
 
 def _limit_texts(predicted: float, measured: float | None) -> list[str]:
     from physjax.show.report import seconds_text
 
-    if measured is None:
+    if not predicted or predicted == float("inf"):
         return ["none" if predicted else "never stable", "-"]
-    return [seconds_text(predicted), seconds_text(measured)]
+    return [seconds_text(predicted), "-" if measured is None else seconds_text(measured)]
 
 
 def _study(name: str, folder: Path, quick: bool):

@@ -11,15 +11,25 @@ SCENES: dict[str, Callable[..., Problem]] = {}
 """Every scene by name: a function that builds its `Problem`, in the float type of the moment (`jax.enable_x64`)."""
 
 
+FAILURES: dict[str, Callable] = {}
+"""Every run that must fail, by name: a function that builds its `Failure`."""
+
+
 def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
     """Enter a function that builds a problem in the gallery, under its own name; the first line of its docstring describes it."""
     SCENES[build.__name__] = build
     return build
 
 
+def failure(build: Callable) -> Callable:
+    """Enter a function that builds a failure, in the same way."""
+    FAILURES[build.__name__] = build
+    return build
+
+
 def title(name: str) -> str:
-    """One line about a scene."""
-    return SCENES[name].__doc__.strip().splitlines()[0]
+    """One line about a scene or a failure."""
+    return (SCENES | FAILURES)[name].__doc__.strip().splitlines()[0]
 
 
 def table(file: str) -> dict[str, np.ndarray]:

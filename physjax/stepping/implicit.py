@@ -19,8 +19,8 @@ from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, solved,
 from physjax.stepping.registry import Promises
 from physjax.vectors import scale
 
-FORCING = 1e-3
-"""Relative residual of the linear systems inside Newton's method: three digits an iteration."""
+ROUGH, FORCING = 0.1, 1e-3
+"""Relative residuals of the linear systems around Newton's method: of the first guess, and three digits an iteration."""
 HALVINGS = 8
 """How often a Newton step that does not lower the residual is halved before it is given up."""
 
@@ -68,12 +68,14 @@ class ImplicitEuler(eqx.Module):
 
     def _step(self, system, t, state, dt):
         step = _Step.of(system, t, state, dt)
-        u, told = self._linearised(step)
         if self.newton:
-            u, told = self._converged(step, lax.stop_gradient(u))
+            guess, _ = self._linearised(step, ROUGH)
+            u, told = self._converged(step, lax.stop_gradient(guess))
+        else:
+            u, told = self._linearised(step, 0.0)
         return step.ended(u), told
 
-    def _linearised(self, step: "_Step") -> tuple[Vector, Solved]:
+    def _linearised(self, step: "_Step", rough: float) -> tuple[Vector, Solved]:
         """u from the equation linearised at the start of the step."""
         near, state, dt = step.near(), step.state, step.dt
         rate, push = jax.linearize(lambda y: near.rate(step.end, y), state)
@@ -81,7 +83,7 @@ class ImplicitEuler(eqx.Module):
         _, move = jax.linearize(lambda u: step.system.drift(step.kicked_by(u), dt), step.nothing())
         b = step.kick(jax.tree.map(jnp.add, rate, push(ahead)))
         matvec = lambda u: _minus(u, step.kick(push(move(step.freed(u)))))  # noqa: E731
-        return self._solve(step, matvec, b, self._floor(b), getattr(near, "definite", False))
+        return self._solve(step, matvec, b, max(rough, self._floor(b)), getattr(near, "definite", False))
 
     def _converged(self, step: "_Step", guess: Vector) -> tuple[Vector, Solved]:
         """u from the full equation, by Newton's method from a guess; its derivative by the implicit function theorem."""
@@ -108,7 +110,9 @@ class ImplicitEuler(eqx.Module):
         def body(carry):
             u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
-            change, told = self._solve(step, tangent, r, FORCING, False)
+            # no more digits than are still missing
+            missing = jnp.sqrt(goal / jnp.where(square > 0, square, 1.0))
+            change, told = self._solve(step, tangent, r, jnp.clip(0.1 * missing, FORCING, ROUGH), False)
             u, after = _searched(step, residual, u, change, square, going)
             count = count + jnp.where(going, told.products, 0)
             return u, after, going & (after > goal) & (after < square), count, i + 1
@@ -125,7 +129,7 @@ class ImplicitEuler(eqx.Module):
         return eps**0.5 if self.tolerance is None else max(self.tolerance, 4 * eps)
 
     def _solve(
-        self, step: "_Step", matvec: Callable, b: Vector, tolerance: float, definite: bool
+        self, step: "_Step", matvec: Callable, b: Vector, tolerance: ArrayLike, definite: bool
     ) -> tuple[Vector, Solved]:
         """matvec(u) = b: in closed form where lanes stand alone, else iteratively."""
         if step.alone and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED:

@@ -15,11 +15,12 @@ from physjax.checks import real_quantity
 from physjax.physics.springs import Springs
 from physjax.scene import Force, Particles, Scene, as_module
 from physjax.show.report import seconds_text
-from physjax.stepping.reference import in_dtype
-from physjax.study.small_motion import SmallMotion, follows_rates, radius, rate_text, small_motion, step_matrices
+from physjax.study.small_motion import SmallMotion, about, follows_rates, radius, rate_text, small_motion, step_matrices
 
 RESTING = 1e-6
 """Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
+ROUNDING = 1e-9
+"""The real part, in parts of the fastest rate, that is none."""
 SEEN = 1e-6
 """Growth of a step matrix's eigenvalue that rounding, which splits the double ones, cannot feign."""
 
@@ -85,15 +86,14 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
     limit. All modes of scenes with up to 300 coordinates are looked at, of larger ones the fastest. Contacts are not.
     """
     with jax.enable_x64(True):
-        scene, state = _linearised_at(scene, at)
-        method_module, name = checked_method(method), name_of(method)
+        scene, state = about(scene, at)
+        module, name = checked_method(method), name_of(method)
         motion = small_motion(scene, state)
-        rates = motion.rates()
-        fastest = np.abs(rates).max(axis=-1)
+        fastest = np.abs(motion.rates()).max(axis=-1)
         if not np.any(fastest > 0):
             return Limit(name, np.inf, np.full(fastest.shape, np.inf), "nothing", "", None, (), 0j)
-        find = _limits_by_rates if follows_rates(method_module) else _limits_by_steps
-        each, worst_mode = find(method_module, motion, rates, fastest)
+        find = _limits_by_rates if motion.undamped or follows_rates(module) else _limits_by_steps
+        each, worst_mode = find(module, motion, fastest)
         # where several blocks are as bad, or nothing sets a limit, the one that moves fastest speaks for all
         block = np.unravel_index(np.argmax(np.where(each == each.min(), fastest, -1.0)), each.shape)
         return Limit(name, float(each[block]), each, *_blamed(scene, state, motion, block, worst_mode(block)))
@@ -106,13 +106,23 @@ def growth(scene: Scene, method: Callable, dt: Any, at: Particles | None = None)
     stable step this is what to expect of a run.
     """
     with jax.enable_x64(True):
-        scene, state = _linearised_at(scene, at)
+        scene, state = about(scene, at)
         motion, method = small_motion(scene, state), checked_method(method)
         dt = np.broadcast_to(np.asarray(real_quantity("dt [s]", dt, above=0.0), float), scene.status_shape)
-        if follows_rates(method):
-            z = _swinging(motion.rates()) * dt[..., None]
+        if motion.undamped or follows_rates(method):
+            z = _swinging(motion) * dt[..., None]
             return np.asarray(radius(method, jnp.asarray(z))).max(axis=-1, initial=1.0)
-        return np.maximum(1.0, _growths(method, motion, dt))
+        return np.maximum(1.0, _growths(method, motion, dt).max(axis=-1))
+
+
+def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
+    """Whether small motions about a state grow whatever the method: a pendulum upside down, bodies that pass each other.
+
+    Shaped like `scene.status_shape`. What a method adds to that cannot be seen in a run.
+    """
+    with jax.enable_x64(True):
+        rates = small_motion(*about(scene, at)).rates()
+        return rates.real.max(axis=-1) > RESTING * np.abs(rates).max(axis=-1)
 
 
 def name_of(method: Callable) -> str:
@@ -129,28 +139,23 @@ def checked_method(method: Callable) -> Any:
     return as_module(method)
 
 
-def _linearised_at(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
-    if not isinstance(scene, Scene):
-        raise TypeError(f"stability: got a {type(scene).__name__}, expected a Scene.")
-    scene = in_dtype(scene, jnp.float64)
-    state = scene.state if at is None else Particles(*(jnp.asarray(a, jnp.float64) for a in at))
-    if state.position.shape != scene.state.position.shape:
-        raise ValueError(
-            f"at: got positions of shape {state.position.shape}, expected the scene's {scene.state.position.shape}."
-        )
-    return scene, state
+def _swinging(motion: SmallMotion) -> np.ndarray:
+    """Rates without those of drifts and of motions that grow by themselves, set to 0; rounding taken off undamped ones.
 
-
-def _swinging(rates: np.ndarray) -> np.ndarray:
-    """Rates without those of drifts and of motions that grow by themselves, set to 0; rounding taken off undamped ones."""
+    Without damping a mode that grows has a partner that decays: a body that falls from a hilltop, and one that climbs it.
+    """
+    rates = motion.rates()
     fastest = np.abs(rates).max(axis=-1, keepdims=True)
-    rates = np.where(np.abs(rates.real) < 1e-9 * fastest, 1j * rates.imag, rates)
-    return np.where((np.abs(rates) < RESTING * fastest) | (rates.real > 0), 0.0, rates)
+    rates = np.where(np.abs(rates.real) < ROUNDING * fastest, 1j * rates.imag, rates)
+    gone = (np.abs(rates) < RESTING * fastest) | (rates.real > 0)
+    if motion.undamped:
+        gone |= rates.real != 0
+    return np.where(gone, 0.0, rates)
 
 
-def _limits_by_rates(method: Any, motion: SmallMotion, rates: np.ndarray, fastest: np.ndarray) -> tuple:
+def _limits_by_rates(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
     """The limit of each block where the rates decide: the first λ dt on its ray that leaves the region."""
-    swinging = _swinging(rates)
+    swinging = _swinging(motion)
     speed = np.abs(swinging)
     directions = np.where(speed > 0, swinging / np.where(speed > 0, speed, 1.0), -1.0)
     reach = _reach(method, directions)
@@ -160,7 +165,7 @@ def _limits_by_rates(method: Any, motion: SmallMotion, rates: np.ndarray, fastes
         λ, modes = motion.modes(block)
         # all are infinite or 0 under a method that is always or never stable: the fastest is then the first to go
         tie = limits[block] == limits[block].min()
-        target = rates[block][np.argmax(np.where(tie, speed[block], -1.0))]
+        target = swinging[block][np.argmax(np.where(tie, speed[block], -1.0))]
         return modes[:, np.argmin(np.abs(λ - target))]
 
     return limits.min(axis=-1), worst_mode
@@ -183,11 +188,13 @@ def _reach(method: Any, directions: np.ndarray) -> np.ndarray:
     return np.where(out, np.where(never, 0.0, low), np.inf)[back].reshape(directions.shape)
 
 
-def _limits_by_steps(method: Any, motion: SmallMotion, rates: np.ndarray, fastest: np.ndarray) -> tuple:
-    """The limit of each block by the spectral radius of the step itself: doubled until it leaves 1, then halved."""
-    allowed = np.maximum(rates.real.max(axis=-1), 0.0)
+def _limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
+    """The limit of each block by the eigenvalues of the step itself: doubled until one leaves 1, then halved."""
     pace = np.where(fastest > 0, fastest, 1.0)
-    grows = lambda dt: _growths(method, motion, dt) > np.exp(allowed * dt) * (1 + SEEN)  # noqa: E731
+    rates = motion.rates()
+    # what grows by itself does so in a step as well, not quite as fast: it is counted, and one more is the method's doing
+    allowed = np.sum(rates.real > RESTING * pace[..., None], axis=-1)
+    grows = lambda dt: np.sum(_growths(method, motion, dt) > 1 + SEEN, axis=-1) > allowed  # noqa: E731
     low, high, out = np.zeros(pace.shape), 0.01 / pace, np.zeros(pace.shape, bool)
     for _ in range(15):
         out = out | grows(high)
@@ -202,8 +209,12 @@ def _limits_by_steps(method: Any, motion: SmallMotion, rates: np.ndarray, fastes
 
     def worst_mode(block):
         n = motion.stiffness.shape[-1]
-        λ, modes = np.linalg.eig(_matrices(method, motion, np.where(out, high * 1.01, 1 / pace))[block])
-        mode = modes[:, np.argmax(np.abs(λ))]
+        dt = np.where(out, high * 1.01, 1 / pace)
+        μ, modes = np.linalg.eig(_matrices(method, motion, dt)[block])
+        # of those that leave, the one that is furthest from what the scene does by itself
+        strange = np.abs(μ[:, None] - np.exp(rates[block] * dt[block])).min(axis=-1)
+        leaves = np.abs(μ) > 1 + SEEN
+        mode = modes[:, np.argmax(np.where(leaves, 1 + strange, np.abs(μ) / np.abs(μ).max()))]
         return mode if out[block] else np.concatenate([mode[:n], mode[n:]])
 
     return limits, worst_mode
@@ -218,9 +229,9 @@ def _matrices(method: Any, motion: SmallMotion, dt: np.ndarray) -> np.ndarray:
 
 
 def _growths(method: Any, motion: SmallMotion, dt: np.ndarray) -> np.ndarray:
-    """The largest eigenvalue of each block's step; the double 1 of a drift, which rounding splits, is left out."""
-    λ = np.linalg.eigvals(_matrices(method, motion, dt))
-    return np.where(np.abs(λ - 1) < 1e-5, 1.0, np.abs(λ)).max(axis=-1)
+    """The size of each eigenvalue of each block's step; the double 1 of a drift, which rounding splits, counts as 1."""
+    μ = np.linalg.eigvals(_matrices(method, motion, dt))
+    return np.where(np.abs(μ - 1) < 1e-5, 1.0, np.abs(μ))
 
 
 def _blamed(scene: Scene, state: Particles, motion: SmallMotion, block: tuple, mode: np.ndarray) -> tuple:

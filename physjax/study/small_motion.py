@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.scene import Force, Particles, Scene
+from physjax.stepping.reference import in_dtype
 
 DENSE = 300
 """Coordinates of a scene up to which all its modes are found; of larger ones those that move fastest."""
@@ -50,10 +51,28 @@ class SmallMotion(NamedTuple):
         moved = moved if self.basis is None else moved @ self.basis[block]
         return moved / np.linalg.norm(moved)
 
+    @property
+    def undamped(self) -> bool:
+        """Whether forces depend on positions alone: every method then steps each mode by itself."""
+        return not np.any(self.damping)
+
     def _rate_matrix(self) -> np.ndarray:
         zero = np.zeros_like(self.stiffness)
         one = zero + np.eye(zero.shape[-1])
         return np.block([[zero, one], [-self.stiffness, -self.damping]])
+
+
+def about(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
+    """A scene in float64 and the state about which its small motions are asked for: its own, if none is given."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"stability: got a {type(scene).__name__}, expected a Scene.")
+    scene = in_dtype(scene, jnp.float64)
+    state = scene.state if at is None else Particles(*(jnp.asarray(a, jnp.float64) for a in at))
+    if state.position.shape != scene.state.position.shape:
+        raise ValueError(
+            f"at: got positions of shape {state.position.shape}, expected the scene's {scene.state.position.shape}."
+        )
+    return scene, state
 
 
 def small_motion(scene: Scene, state: Particles) -> SmallMotion:

@@ -6,7 +6,7 @@ a method alone. `map` judges runs over methods and steps, `explain` says why one
 
 from physjax.study.explain import Explanation, explain
 from physjax.study.growth import grows, measure_growth, measure_limit
-from physjax.study.limits import Limit, Region, growth, limit, region
+from physjax.study.limits import Limit, Region, grows_by_itself, growth, limit, region
 from physjax.study.stability_map import StabilityMap, map
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "StabilityMap",
     "explain",
     "grows",
+    "grows_by_itself",
     "growth",
     "limit",
     "map",

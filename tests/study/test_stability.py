@@ -195,3 +195,29 @@ def test_bad_input_is_refused():
         stability.limit(oscillator(), methods.rk4, at=Particles(jnp.ones(2), jnp.ones(2)))
     with pytest.raises(ValueError, match="smaller step first"):
         stability.measure_limit(oscillator(), methods.rk4, between=(1.0, 0.1))
+
+
+def test_a_scene_that_moves_is_measured_about_a_state_of_its_own():
+    drag = forces.QuadraticDrag(area=0.7, coefficient=1.0)
+    fall = Particles(jnp.zeros(2), jnp.asarray([0.0, -40.0]))
+    scene = Scene(Particles(jnp.zeros(2), jnp.zeros(2)), mass=80.0, forces=(forces.Gravity(), drag))
+    rate = 1.225 * 0.7 * 40.0 / 80.0
+    assert np.isinf(stability.limit(scene, methods.euler).dt)
+    assert stability.limit(scene, methods.euler, fall).dt == pytest.approx(2 / rate, rel=1e-6)
+    assert stability.measure_limit(scene, methods.euler, fall) == pytest.approx(2 / rate, rel=0.02)
+
+
+@pytest.mark.parametrize("method", [methods.semi_implicit_euler, methods.verlet, methods.rk4], ids=lambda m: m.__name__)
+@pytest.mark.parametrize("b", [None, 0.2])
+def test_what_grows_by_itself_sets_no_limit_and_does_not_hide_what_does(method, b):
+    # a saddle: away from the hill at 1/s along x, to and fro at 10/s along y
+    drag = () if b is None else (forces.StokesDrag(b),)
+    hill = forces.Anchor(point=jnp.zeros(2), stiffness=100.0)
+    push = forces.independent(
+        lambda t, s, m: jnp.stack([101.0 * s.position[..., 0], 0.0 * s.position[..., 1]], axis=-1)
+    )
+    lanes = Particles(jnp.zeros((2, 2)), jnp.zeros((2, 2)))
+    scene = Scene(lanes, forces=(hill, push, *drag))
+    assert stability.grows_by_itself(scene).all()
+    promised = method.promises.stable_to / 10.0
+    assert stability.limit(scene, method).dt == pytest.approx(promised, rel=0.05 if b else 1e-6)
