@@ -54,24 +54,24 @@ def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
         )
     if not hasattr(surface, "gap"):
         surface = as_module(surface) if callable(surface) else Height(surface)
-    return _crossing(run, surface, direction)
+    return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
 @eqx.filter_jit
-def _crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
-    find = lambda run: _crossing_of_one(run, surface, direction)  # noqa: E731
+def _crossing(run: Any, surface: Any, way: Array) -> Crossing:
+    find = lambda run: _crossing_of_one(run, surface, way)  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
         find = jax.vmap(find)
     return find(run)
 
 
-def _crossing_of_one(run: Any, surface: Any, direction: int | None) -> Crossing:
+def _crossing_of_one(run: Any, surface: Any, way: Array) -> Crossing:
     scene, gap = run.scene, _checked_gap(surface, run.scene)
     if not scene.couples:
-        return _unit_crossing(run, gap, direction, lambda leaf: leaf)
+        return _unit_crossing(run, gap, way, lambda leaf: leaf)
 
     def of_node(n):
-        return _unit_crossing(run, lambda t, x: gap(t, x)[..., n], direction, lambda leaf: leaf[..., n, :])
+        return _unit_crossing(run, lambda t, x: gap(t, x)[..., n], way, lambda leaf: leaf[..., n, :])
 
     # a node's moment is its own, and the whole scene is stepped to it
     nodes = jnp.arange(scene.state.lanes[-1], dtype=jnp.int32)
@@ -126,10 +126,10 @@ class _Replay(NamedTuple):
         return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(x.dtype).eps) * size, 0.0, value)
 
 
-def _unit_crossing(run: Any, gap: Callable, direction: int | None, own: Callable) -> Crossing:
+def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossing:
     """The first crossing of every lane, or, where they are coupled, of one node in every scene, which `own` picks."""
     replay = _replay(run, gap)
-    place = _search(replay.held(), direction)
+    place = _search(replay.held(), way)
     moving = replay.at(place.frame)
 
     def forward(i, moving):
@@ -168,10 +168,10 @@ def _replay(run: Any, gap: Callable) -> _Replay:
     return _Replay(frames, step, gap, run.first_step, run.save_every, dt)
 
 
-def _search(replay: _Replay, direction: int | None) -> _Place:
+def _search(replay: _Replay, way: Array) -> _Place:
     """Frame and step of the first crossing, by stepping again through the frames between which there may be one."""
     shape, zero = replay.dt.shape, jnp.zeros(replay.dt.shape, jnp.int32)
-    hopes = _hopes(replay, direction)
+    hopes = _hopes(replay, way)
     numbers = jnp.arange(len(hopes), dtype=jnp.int32).reshape(-1, *(1 for _ in shape))
     ahead = lambda cursor: hopes & (numbers >= cursor[None])  # noqa: E731
 
@@ -182,7 +182,7 @@ def _search(replay: _Replay, direction: int | None) -> _Place:
     def look(carry):
         cursor, place = carry
         frame = jnp.argmax(ahead(cursor), axis=0).astype(jnp.int32)
-        seen = _stepped_through(replay, frame, direction)
+        seen = _stepped_through(replay, frame, way)
         new = seen.found & jnp.any(ahead(cursor), axis=0) & ~place.found
         return frame + 1, jax.tree.map(lambda a, b: jnp.where(new, a, b), seen, place)
 
@@ -191,7 +191,7 @@ def _search(replay: _Replay, direction: int | None) -> _Place:
     return lax.while_loop(going, look, (zero, place))[1]
 
 
-def _stepped_through(replay: _Replay, frame: Array, direction: int | None) -> _Place:
+def _stepped_through(replay: _Replay, frame: Array, way: Array) -> _Place:
     """The first step after a frame at whose end the gap has another sign than at its start."""
 
     def one(i, carry):
@@ -199,7 +199,7 @@ def _stepped_through(replay: _Replay, frame: Array, direction: int | None) -> _P
         t = replay.time(frame, i)
         moving = replay.step(moving, t, replay.dt)
         after = replay.signed(t + replay.dt, moving)
-        here = _crosses(now, after, direction) & ~place.found
+        here = _crosses(now, after, way) & ~place.found
         new = _Place(frame, jnp.full_like(frame, i), now, after, here)
         return moving, after, jax.tree.map(lambda a, b: jnp.where(here, a, b), new, place)
 
@@ -209,7 +209,7 @@ def _stepped_through(replay: _Replay, frame: Array, direction: int | None) -> _P
     return lax.fori_loop(0, replay.every, one, start)[2]
 
 
-def _hopes(replay: _Replay, direction: int | None) -> Bool[Array, "intervals *lanes"]:
+def _hopes(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:
     """Between which frames there may be a crossing: where the cubic through them changes its sign, which may be at neither."""
 
     def gap_and_rate(frame, moving):
@@ -226,14 +226,14 @@ def _hopes(replay: _Replay, direction: int | None) -> Bool[Array, "intervals *la
     level = [jnp.clip(jnp.nan_to_num(s, nan=1.0), 0.0, 1.0) for s in (-root / (3 * a), -r0 / root)]
     middle = [d0 + s * (r0 + s * (b + s * a)) for s in (jnp.minimum(*level), jnp.maximum(*level))]
     ends = [d0, *middle, d1]
-    pieces = [_crosses(before, after, direction) for before, after in pairwise(ends)]
-    return jnp.any(jnp.stack([_crosses(d0, d1, direction), *pieces]), axis=0)
+    pieces = [_crosses(before, after, way) for before, after in pairwise(ends)]
+    return jnp.any(jnp.stack([_crosses(d0, d1, way), *pieces]), axis=0)
 
 
-def _crosses(before: Array, after: Array, direction: int | None) -> Array:
+def _crosses(before: Array, after: Array, way: Array) -> Array:
     """Whether a gap changes its sign in the wanted direction; what starts at zero does not cross, what arrives there does."""
     falls, rises = (before > 0) & (after <= 0), (before < 0) & (after >= 0)
-    return falls | rises if direction is None else falls if direction < 0 else rises
+    return (falls & (way <= 0)) | (rises & (way >= 0))
 
 
 def _constant(function: Callable, *examples: Any) -> Callable:

@@ -35,7 +35,7 @@ def test_without_drag_a_throw_lands_where_the_closed_form_says():
 
 @pytest.mark.parametrize(("method", "order"), [(methods.rk4, 4), (methods.verlet, 2), (methods.semi_implicit_euler, 1)])
 def test_the_error_falls_with_the_order_of_the_method_though_every_tenth_step_was_saved(method, order):
-    truth = thrown(SPEEDS, dt=0.05 / 64, steps=60 * 64).crossing(-2.0)
+    truth = thrown(SPEEDS, dt=0.05 / 32, steps=60 * 32).crossing(-2.0)
     errors = []
     for finer in (1, 2, 4):
         at = thrown(SPEEDS, method, dt=0.05 / finer, steps=60 * finer).crossing(-2.0)
@@ -48,14 +48,15 @@ def test_the_error_falls_with_the_order_of_the_method_though_every_tenth_step_wa
 def test_the_crossing_lies_on_the_path_of_an_independent_solver():
     flight = thrown(SPEEDS, dt=0.01, steps=300, save_every=100)
     at = flight.crossing(contacts.Plane((5.0, 0.0), (-1.0, 0.5)))
-    for lane, moment in enumerate(at.time):
-        truth = reference(flight.scene, [float(moment)])
-        np.testing.assert_allclose(at.position[lane], truth.position[0, lane], atol=1e-9)
-        np.testing.assert_allclose(at.velocity[lane], truth.velocity[0, lane], atol=1e-9)
+    order = np.argsort(at.time)
+    truth = reference(flight.scene, np.asarray(at.time)[order])
+    for moment, lane in enumerate(order):
+        np.testing.assert_allclose(at.position[lane], truth.position[moment, lane], atol=1e-9)
+        np.testing.assert_allclose(at.velocity[lane], truth.velocity[moment, lane], atol=1e-9)
 
 
 def test_frames_do_not_matter():
-    every = [thrown(SPEEDS, save_every=n).crossing(2.0, direction=-1) for n in (1, 4, 15, 60)]
+    every = [thrown(SPEEDS, save_every=n).crossing(2.0, direction=-1) for n in (1, 15, 60)]
     for other in every[1:]:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), other, every[0])
 
@@ -104,41 +105,48 @@ def test_a_surface_may_move_and_may_be_a_function():
 
 
 def test_a_ball_is_followed_through_its_bounces():
-    ball = Scene(
-        Particles(jnp.asarray([0.0, 1.0]), jnp.asarray([1.0, 0.0])),
+    start = jnp.asarray([[0.0, 0.2]] * 2)
+    balls = Scene(
+        Particles(start, jnp.asarray([[1.0, -5.0]] * 2)),
         forces=(forces.Gravity(),),
         contacts=(contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.8),),
     )
-    run = simulate(ball, methods.rk4, dt=0.02, steps=100, save_every=20)
-    at = run.crossing(0.5, direction=1)
-    impact = np.sqrt(2 / 9.8)
-    up = 0.8 * 9.8 * impact
-    np.testing.assert_allclose(at.time, impact + (up - np.sqrt(up**2 - 9.8)) / 9.8, rtol=1e-12)
-    assert not run.crossing(-1e-9).ok  # a bounce is no crossing
+    run = simulate(balls, methods.rk4, dt=0.02, steps=50, save_every=10)
+    at = run.crossing([0.5, -1e-9], direction=-1)
+    down = np.sqrt(25 + 2 * 9.8 * 0.2)
+    exact = (down - 5) / 9.8 + (0.8 * down + np.sqrt(0.64 * down**2 - 9.8)) / 9.8
+    np.testing.assert_array_equal(at.ok, [True, False])  # a bounce is no crossing
+    np.testing.assert_allclose(at.time[0], exact, rtol=1e-12)
 
 
 # derivatives
 
-BOTH = pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev], ids=["forward", "reverse"])
+
+def derivatives(function, at, step=1e-5):
+    """By forward mode, by reverse mode, and by central differences, each compiled as a whole."""
+    trials = at[None] + step * np.concatenate([np.eye(len(at)), -np.eye(len(at))])
+    plus, minus = np.split(np.asarray(jax.jit(jax.vmap(function))(trials)), 2)
+    modes = [np.asarray(jax.jit(mode(function))(at)) for mode in (jax.jacfwd, jax.jacrev)]
+    return *modes, np.moveaxis((plus - minus) / (2 * step), 0, -1)
 
 
-@BOTH
-def test_the_moment_moves_with_every_number(derivative):
+def test_the_moment_moves_with_every_number():
     def landing(numbers):
         speed, drag, height, dt = numbers
         shot = thrown(speed * jnp.asarray([[0.6, 0.8]]), drag=drag, dt=0.05 * dt).crossing(height, direction=-1)
         return jnp.concatenate([shot.time, shot.position[0], shot.velocity[0]])
 
-    at, step = jnp.asarray([15.0, 0.4, 1.0, 1.0]), 1e-5
-    central = [(landing(at + d) - landing(at - d)) / (2 * step) for d in step * jnp.eye(4)]
-    np.testing.assert_allclose(derivative(landing)(at), np.stack(central, -1), rtol=1e-6, atol=1e-8)
+    forward, reverse, central = derivatives(landing, jnp.asarray([15.0, 0.4, 1.0, 1.0]))
+    np.testing.assert_allclose(forward, central, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
 
 
 def test_without_drag_the_derivatives_are_those_of_the_closed_form():
     landing = lambda v: thrown(v, drag=0.0).crossing(0.0).position[0]  # noqa: E731
     v = jnp.asarray([10.0, 12.0])
-    np.testing.assert_allclose(jax.grad(landing)(v), 2 * v[::-1] / 9.8, rtol=1e-12)
-    np.testing.assert_allclose(jax.hessian(landing)(v), 2 / 9.8 * (1 - np.eye(2)), atol=1e-10)
+    slope, bend = jax.jit(lambda v: (jax.grad(landing)(v), jax.hessian(landing)(v)))(v)
+    np.testing.assert_allclose(slope, 2 * v[::-1] / 9.8, rtol=1e-12)
+    np.testing.assert_allclose(bend, 2 / 9.8 * (1 - np.eye(2)), atol=1e-10)
 
 
 def test_functions_may_close_over_what_is_differentiated():
@@ -147,9 +155,9 @@ def test_functions_may_close_over_what_is_differentiated():
         brake = forces.independent(lambda t, state, mass: -pull * state.velocity)
         return thrown([10.0, 12.0], parts=(brake,)).crossing(lambda t, x: x[..., 1] + level).time
 
-    at, step = jnp.asarray([0.02, 0.5]), 1e-5
-    central = [(landing(at + d) - landing(at - d)) / (2 * step) for d in step * jnp.eye(2)]
-    np.testing.assert_allclose(jax.grad(landing)(at), central, rtol=1e-7)
+    forward, reverse, central = derivatives(landing, jnp.asarray([0.02, 0.5]))
+    np.testing.assert_allclose(forward, central, rtol=1e-7)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
 
 
 # lanes, scenes, parts
@@ -166,7 +174,7 @@ def test_batches_agree_with_lanes():
 def pendulums(offset):
     """Two bodies on springs that attract each other, in two scenes."""
     x = jnp.asarray([[[1.0, 0.5], [-1.0, 1.2]], [[1.1, 0.8], [-0.9, 1.0]]]) + offset
-    parts = (forces.Anchor(point=jnp.zeros(2), stiffness=3.0), forces.Gravitation(G=0.3))
+    parts = (forces.Anchor(point=jnp.zeros(2), stiffness=3.0), forces.Gravitation(G=0.02))
     return simulate(Scene(Particles(x, 0.0 * x), forces=parts), methods.rk4, dt=0.01, steps=200, save_every=50)
 
 
@@ -176,19 +184,20 @@ def test_coupled_nodes_have_moments_of_their_own():
     assert at.time.shape == (2, 2)
     assert at.ok.all()
     assert len(set(at.time.ravel().tolist())) == 4
-    for scene, node in np.ndindex(2, 2):
+    for scene in range(2):
         alone = run.scene.having(state=jax.tree.map(lambda leaf, s=scene: leaf[s], run.scene.state))
-        truth = reference(alone, [float(at.time[scene, node])])
-        np.testing.assert_allclose(at.position[scene, node], truth.position[0, node], atol=1e-7)
-        np.testing.assert_allclose(at.velocity[scene, node], truth.velocity[0, node], atol=1e-7)
+        order = np.argsort(at.time[scene])
+        truth = reference(alone, np.asarray(at.time[scene])[order])
+        for moment, node in enumerate(order):
+            np.testing.assert_allclose(at.position[scene, node], truth.position[moment, node], atol=1e-8)
+            np.testing.assert_allclose(at.velocity[scene, node], truth.velocity[moment, node], atol=1e-8)
     np.testing.assert_allclose(at.position[..., 1], 0.2, rtol=1e-14)
 
 
-@BOTH
-def test_moments_of_coupled_nodes_are_differentiable(derivative):
-    when = lambda offset: pendulums(offset).crossing(0.2).time  # noqa: E731
-    central = (when(1e-5) - when(-1e-5)) / 2e-5
-    np.testing.assert_allclose(derivative(when)(jnp.asarray(0.0)), central, rtol=1e-7)
+def test_moments_of_coupled_nodes_are_differentiable():
+    forward, reverse, central = derivatives(lambda offset: pendulums(offset[0]).crossing(0.2).time, jnp.zeros(1))
+    np.testing.assert_allclose(forward, central, rtol=1e-7)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
 
 
 class Burner(eqx.Module):
