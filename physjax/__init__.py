@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from physjax.physics import contacts, lattices, springs
     from physjax.show import animate, plot
     from physjax.study import accuracy, energy, projectile, stability
+    from physjax.study.fit import fit
 
 __all__ = [
     "Contact",
@@ -29,6 +30,7 @@ __all__ = [
     "animate",
     "contacts",
     "energy",
+    "fit",
     "forces",
     "lattices",
     "loads",
@@ -50,6 +52,7 @@ _LATER = {
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
+    "fit": "physjax.study.fit:fit",
     "lattices": "physjax.physics.lattices",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
@@ -61,7 +64,9 @@ _LATER = {
 
 def __getattr__(name: str) -> object:
     if name in _LATER:
-        return import_module(_LATER[name])
+        module, _, function = _LATER[name].partition(":")
+        found = import_module(module)
+        return getattr(found, function) if function else found
     raise AttributeError(f"module 'physjax' has no attribute {name!r}")
 
 
