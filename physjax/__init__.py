@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from physjax import scenes
     from physjax.physics import contacts, lattices, springs
     from physjax.show import animate, plot
-    from physjax.study import accuracy, energy, projectile, stability
+    from physjax.study import accuracy, energy, gradients, projectile, stability
     from physjax.study.fit import fit
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "energy",
     "fit",
     "forces",
+    "gradients",
     "lattices",
     "loads",
     "methods",
@@ -53,6 +54,7 @@ _LATER = {
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
     "fit": "physjax.study.fit:fit",
+    "gradients": "physjax.study.gradients",
     "lattices": "physjax.physics.lattices",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
