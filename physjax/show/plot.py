@@ -116,8 +116,12 @@ def gradient_health(result: Any, ax: Any = None) -> Any:
     place = {"xycoords": ax.get_yaxis_transform(), "xytext": (0, -3), "textcoords": "offset points", "va": "top"}
     ax.annotate(words, (0.02, limit.min()), fontsize=9, color=PALETTE[0], **place)
     first = horizon.min()
-    until = f"ends at {seconds_text(first)}" if first < 1e3 * end.max() else "does not end in a thousand such runs"
-    ax.set(yscale="log", xlabel="time [s]", title=f"trust in the {'' if one else 'first '}gradient {until}")
+    until = f"up to {seconds_text(first)}" if first < 1e3 * end.max() else "for more than a thousand such runs"
+    ax.set(
+        yscale="log",
+        xlabel="time [s]",
+        title=f"{'the gradient is' if one else 'all gradients are'} to be trusted {until}",
+    )
     ax.set_ylabel(f"growth of a deviation [m per {'m' if result.of == 'position' else 'm/s'}]")
     ax.set_ylim(top=5 * max(limit.max(), grown[np.isfinite(grown)].max()))
     ax.grid(which="major", color="0.9")
