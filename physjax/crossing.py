@@ -74,8 +74,10 @@ def _crossing_of_one(run: Any, surface: Any, way: Array) -> Crossing:
         return _unit_crossing(run, lambda t, x: gap(t, x)[..., n], way, lambda leaf: leaf[..., n, :])
 
     # a node's moment is its own, and the whole scene is stepped to it
-    nodes = jnp.arange(scene.state.lanes[-1], dtype=jnp.int32)
-    found = lax.map(jax.checkpoint(of_node), nodes, batch_size=TOGETHER)
+    count = scene.state.lanes[-1]
+    nodes = jnp.arange(count, dtype=jnp.int32)
+    few = count <= TOGETHER
+    found = jax.vmap(of_node)(nodes) if few else lax.map(jax.checkpoint(of_node), nodes, batch_size=TOGETHER)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(scene.status_shape)), found)
 
 

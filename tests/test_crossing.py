@@ -25,7 +25,7 @@ def thrown(velocity, method=methods.rk4, dt=0.05, steps=60, save_every=10, drag=
 
 
 def test_without_drag_a_throw_lands_where_the_closed_form_says():
-    at = thrown(SPEEDS, drag=0.0, steps=80).crossing(0.0)
+    at = thrown(SPEEDS, drag=0.0).crossing(0.0)
     assert at.ok.all()
     np.testing.assert_allclose(at.time, 2 * SPEEDS[:, 1] / 9.8, rtol=1e-14)
     np.testing.assert_allclose(at.position[:, 0], at.time * SPEEDS[:, 0], rtol=1e-14)
@@ -33,30 +33,30 @@ def test_without_drag_a_throw_lands_where_the_closed_form_says():
     np.testing.assert_allclose(at.velocity, SPEEDS * [1, -1], rtol=1e-13)
 
 
-@pytest.mark.parametrize(("method", "order"), [(methods.rk4, 4), (methods.verlet, 2), (methods.semi_implicit_euler, 1)])
-def test_the_error_falls_with_the_order_of_the_method_though_every_tenth_step_was_saved(method, order):
-    truth = thrown(SPEEDS, dt=0.05 / 32, steps=60 * 32).crossing(-2.0)
-    errors = []
-    for finer in (1, 2, 4):
-        at = thrown(SPEEDS, method, dt=0.05 / finer, steps=60 * finer).crossing(-2.0)
-        assert at.ok.all()
-        errors.append([np.abs(a - b).max() for a, b in zip(at[:3], truth[:3], strict=True)])
-    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert (orders >= order - (0.5 if order == 4 else 0.15)).all(), orders
+def test_the_error_falls_with_the_order_of_the_method_though_every_tenth_step_was_saved():
+    truth = thrown(SPEEDS, dt=0.05 / 16, steps=60 * 16).crossing(-2.0)
+    for method, least in ((methods.rk4, 3.5), (methods.verlet, 1.85)):
+        errors = []
+        for finer in (1, 2):
+            at = thrown(SPEEDS, method, dt=0.05 / finer, steps=60 * finer).crossing(-2.0)
+            assert at.ok.all()
+            errors.append([np.abs(a - b).max() for a, b in zip(at[:3], truth[:3], strict=True)])
+        orders = np.log2(np.divide(*errors))
+        assert (orders >= least).all(), orders
 
 
 def test_the_crossing_lies_on_the_path_of_an_independent_solver():
-    flight = thrown(SPEEDS, dt=0.01, steps=300, save_every=100)
+    flight = thrown(SPEEDS)
     at = flight.crossing(contacts.Plane((5.0, 0.0), (-1.0, 0.5)))
     order = np.argsort(at.time)
     truth = reference(flight.scene, np.asarray(at.time)[order])
     for moment, lane in enumerate(order):
-        np.testing.assert_allclose(at.position[lane], truth.position[moment, lane], atol=1e-9)
-        np.testing.assert_allclose(at.velocity[lane], truth.velocity[moment, lane], atol=1e-9)
+        np.testing.assert_allclose(at.position[lane], truth.position[moment, lane], atol=2e-8)
+        np.testing.assert_allclose(at.velocity[lane], truth.velocity[moment, lane], atol=2e-8)
 
 
 def test_frames_do_not_matter():
-    every = [thrown(SPEEDS, save_every=n).crossing(2.0, direction=-1) for n in (1, 15, 60)]
+    every = [thrown(SPEEDS, save_every=n).crossing(2.0, direction=-1) for n in (1, 10, 60)]
     for other in every[1:]:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), other, every[0])
 
@@ -73,7 +73,7 @@ def test_upward_downward_or_whichever_comes_first():
 
 
 def test_each_lane_may_have_its_own_height_and_those_that_miss_say_so():
-    at = thrown(SPEEDS, steps=20).crossing([1.0, 20.0, 2.0])
+    at = thrown(SPEEDS).crossing([1.0, 20.0, 2.0])
     np.testing.assert_array_equal(at.ok, [True, False, True])
     np.testing.assert_allclose(at.position[[0, 2], 1], [1.0, 2.0], rtol=1e-14)
     for told in at[:3]:
@@ -83,15 +83,17 @@ def test_each_lane_may_have_its_own_height_and_those_that_miss_say_so():
 def test_what_starts_on_a_tilted_plane_does_not_cross_it_at_once():
     slope = contacts.Plane((0.0, 0.0), (-np.sin(0.3), np.cos(0.3)))
     angles = np.linspace(0.4, 1.5, 200)
-    flight = thrown(15 * np.stack([np.cos(angles), np.sin(angles)], -1), drag=0.0, steps=80, save_every=20)
+    flight = thrown(15 * np.stack([np.cos(angles), np.sin(angles)], -1), drag=0.0, dt=0.06)
     at = flight.crossing(slope)
     assert at.ok.all()
     np.testing.assert_allclose(at.time, 2 * 15 * np.sin(angles - 0.3) / (9.8 * np.cos(0.3)), rtol=1e-12)
 
 
 def test_a_visit_between_two_frames_is_seen():
-    at = thrown([2.0, 6.0], drag=0.0, dt=0.01, steps=240, save_every=120).crossing(1.5)
-    np.testing.assert_allclose(at.time, (6 - np.sqrt(36 - 2 * 9.8 * 1.5)) / 9.8, rtol=1e-12)
+    flight = thrown([2.0, 6.0], drag=0.0, dt=0.04)
+    at = flight.crossing(1.8)
+    assert (flight.position[:, 1] < 1.8).all()
+    np.testing.assert_allclose(at.time, (6 - np.sqrt(36 - 2 * 9.8 * 1.8)) / 9.8, rtol=1e-12)
 
 
 def test_a_surface_may_move_and_may_be_a_function():
@@ -109,10 +111,11 @@ def bounced(restitution):
     start = jnp.asarray([[0.0, 0.2]] * 2)
     floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=restitution)
     balls = Scene(Particles(start, jnp.asarray([[1.0, -5.0]] * 2)), forces=(forces.Gravity(),), contacts=(floor,))
-    run = simulate(balls, methods.verlet, dt=0.02, steps=50, save_every=10)
+    run = simulate(balls, methods.leapfrog, dt=0.02, steps=50, save_every=10)
     return run.crossing([0.5, -1e-9], direction=-1)
 
 
+@pytest.mark.slow
 def test_a_ball_is_followed_through_its_bounce():
     at, moved = jax.jit(lambda r: jax.jvp(bounced, (r,), (1.0,)))(0.8)
     down = np.sqrt(25 + 2 * 9.8 * 0.2)
@@ -125,12 +128,11 @@ def test_a_ball_is_followed_through_its_bounce():
 # derivatives
 
 
-def derivatives(function, at, step=1e-5):
-    """By forward mode, by reverse mode, and by central differences, each compiled as a whole."""
+def derivatives(function, at, *modes, step=1e-5):
+    """By central differences and by the modes, each compiled as a whole."""
     trials = at[None] + step * np.concatenate([np.eye(len(at)), -np.eye(len(at))])
     plus, minus = np.split(np.asarray(jax.jit(jax.vmap(function))(trials)), 2)
-    modes = [np.asarray(jax.jit(mode(function))(at)) for mode in (jax.jacfwd, jax.jacrev)]
-    return *modes, np.moveaxis((plus - minus) / (2 * step), 0, -1)
+    return np.moveaxis((plus - minus) / (2 * step), 0, -1), *(jax.jit(mode(function))(at) for mode in modes)
 
 
 def test_the_moment_moves_with_every_number():
@@ -139,17 +141,16 @@ def test_the_moment_moves_with_every_number():
         shot = thrown(speed * jnp.asarray([[0.6, 0.8]]), drag=drag, dt=0.05 * dt).crossing(height, direction=-1)
         return jnp.concatenate([shot.time, shot.position[0], shot.velocity[0]])
 
-    forward, reverse, central = derivatives(landing, jnp.asarray([15.0, 0.4, 1.0, 1.0]))
+    at = jnp.asarray([15.0, 0.4, 1.0, 1.0])
+    central, forward, reverse = derivatives(landing, at, jax.jacfwd, jax.jacrev)
     np.testing.assert_allclose(forward, central, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-14)
 
 
-def test_without_drag_the_derivatives_are_those_of_the_closed_form():
-    landing = lambda v: thrown(v, drag=0.0).crossing(0.0).position[0]  # noqa: E731
+def test_without_drag_the_slope_is_that_of_the_closed_form():
     v = jnp.asarray([10.0, 12.0])
-    slope, bend = jax.jit(lambda v: (jax.grad(landing)(v), jax.hessian(landing)(v)))(v)
+    slope = jax.jit(jax.grad(lambda v: thrown(v, drag=0.0).crossing(0.0).position[0]))(v)
     np.testing.assert_allclose(slope, 2 * v[::-1] / 9.8, rtol=1e-12)
-    np.testing.assert_allclose(bend, 2 / 9.8 * (1 - np.eye(2)), atol=1e-10)
 
 
 def test_functions_may_close_over_what_is_differentiated():
@@ -158,9 +159,8 @@ def test_functions_may_close_over_what_is_differentiated():
         brake = forces.independent(lambda t, state, mass: -pull * state.velocity)
         return thrown([10.0, 12.0], parts=(brake,)).crossing(lambda t, x: x[..., 1] + level).time
 
-    forward, reverse, central = derivatives(landing, jnp.asarray([0.02, 0.5]))
-    np.testing.assert_allclose(forward, central, rtol=1e-7)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+    central, reverse = derivatives(landing, jnp.asarray([0.02, 0.5]), jax.grad)
+    np.testing.assert_allclose(reverse, central, rtol=1e-7)
 
 
 # lanes, scenes, parts
@@ -168,10 +168,8 @@ def test_functions_may_close_over_what_is_differentiated():
 
 def test_batches_agree_with_lanes():
     lanes = thrown(SPEEDS).crossing(1.0, direction=-1)
-    inside = jax.vmap(lambda v: thrown(v).crossing(1.0, direction=-1))(jnp.asarray(SPEEDS))
-    outside = jax.vmap(thrown)(jnp.asarray(SPEEDS)).crossing(1.0, direction=-1)
-    for batch in (inside, outside):
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), batch, lanes)
+    batch = jax.vmap(thrown)(jnp.asarray(SPEEDS)).crossing(1.0, direction=-1)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), batch, lanes)
 
 
 def pendulums(offset):
@@ -198,9 +196,9 @@ def test_coupled_nodes_have_moments_of_their_own():
 
 
 def test_moments_of_coupled_nodes_are_differentiable():
-    forward, reverse, central = derivatives(lambda offset: pendulums(offset[0]).crossing(0.2).time, jnp.zeros(1))
-    np.testing.assert_allclose(forward, central, rtol=1e-7)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+    first = lambda offset: jnp.sum(pendulums(offset[0]).crossing(0.2).time[0])  # noqa: E731
+    central, reverse = derivatives(first, jnp.zeros(1), jax.grad)
+    np.testing.assert_allclose(reverse, central, rtol=1e-7)
 
 
 class Burner(eqx.Module):
@@ -242,7 +240,9 @@ def test_lanes_may_have_steps_of_their_own_and_runs_may_be_resumed():
     lanes = thrown(SPEEDS, dt=dt, steps=60, drag=0.0).crossing(-1.0)
     np.testing.assert_allclose(lanes.time[2], (8 + np.sqrt(64 + 2 * 9.8)) / 9.8, rtol=1e-13)
     first = thrown(SPEEDS, drag=0.0)
-    rest = simulate(first.final_scene, methods.rk4, dt=0.05, steps=10, first_step=first.final_step).crossing(-10.0)
+    rest = simulate(
+        first.final_scene, methods.rk4, dt=0.05, steps=60, save_every=10, first_step=first.final_step
+    ).crossing(-10.0)
     np.testing.assert_allclose(rest.time[1], (14 + np.sqrt(14**2 + 2 * 9.8 * 10)) / 9.8, rtol=1e-13)
 
 
