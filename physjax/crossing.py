@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import quantity
-from physjax.lanes import any_lane
+from physjax.lanes import any_lane, wide
 from physjax.loops import repeat, time_at
 from physjax.roots import first_root
 from physjax.scene import as_module
@@ -136,7 +136,7 @@ def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossi
 
     def forward(i, moving):
         after = replay.step(moving, replay.time(place.frame, i), replay.dt)
-        return jax.tree.map(lambda a, b: jnp.where(_wide(i < place.step, a), a, b), after, moving)
+        return jax.tree.map(lambda a, b: jnp.where(wide(i < place.step, a), a, b), after, moving)
 
     if replay.every > 1:
         moving = repeat(forward, moving, jnp.zeros((), jnp.int32), replay.every - 1)
@@ -152,7 +152,7 @@ def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossi
     search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
     duration = first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
     x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
-    told = lambda leaf: jnp.where(_wide(place.found, leaf), leaf, jnp.nan)  # noqa: E731
+    told = lambda leaf: jnp.where(wide(place.found, leaf), leaf, jnp.nan)  # noqa: E731
     return Crossing(told(begun + duration), told(x), told(v), place.found)
 
 
@@ -258,11 +258,6 @@ def _picked(leaf: Array, frame: Array) -> Array:
         return leaf[frame]
     index = frame.reshape(1, *frame.shape, *(1 for _ in range(leaf.ndim - 1 - frame.ndim)))
     return jnp.take_along_axis(leaf, index, axis=0)[0]
-
-
-def _wide(number: Array, like: Array) -> Array:
-    """A number of each lane with the axes of an array that has more of them."""
-    return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))
 
 
 def _checked_gap(surface: Any, scene: Any) -> Callable:
