@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from physjax import scenes
     from physjax.physics import contacts, lattices, springs
     from physjax.show import animate, plot
-    from physjax.study import accuracy, energy, projectile, stability
+    from physjax.study import accuracy, energy, gradients, projectile, stability
+    from physjax.study.fit import fit
 
 __all__ = [
     "Contact",
@@ -29,7 +30,9 @@ __all__ = [
     "animate",
     "contacts",
     "energy",
+    "fit",
     "forces",
+    "gradients",
     "lattices",
     "loads",
     "methods",
@@ -50,6 +53,8 @@ _LATER = {
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
+    "fit": "physjax.study.fit:fit",
+    "gradients": "physjax.study.gradients",
     "lattices": "physjax.physics.lattices",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
@@ -61,7 +66,9 @@ _LATER = {
 
 def __getattr__(name: str) -> object:
     if name in _LATER:
-        return import_module(_LATER[name])
+        module, _, function = _LATER[name].partition(":")
+        found = import_module(module)
+        return getattr(found, function) if function else found
     raise AttributeError(f"module 'physjax' has no attribute {name!r}")
 
 

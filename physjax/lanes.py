@@ -28,6 +28,11 @@ def is_per_lane(leaf: Any, lanes: tuple[int, ...]) -> bool:
     return hasattr(leaf, "shape") and leaf.shape[: len(lanes)] == lanes
 
 
+def wide(number: Array, like: Array) -> Array:
+    """A number of each scene or lane, with the axes of an array of the state."""
+    return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))
+
+
 @jax.custom_batching.custom_vmap
 def any_lane(flag: Bool[Array, "..."]) -> Bool[Array, ""]:
     """Whether any lane is flagged, of this scene and of all that are batched with it: one answer for the whole batch."""

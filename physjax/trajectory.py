@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete
+from physjax.crossing import Crossing, first_crossing
 from physjax.files import replacing
 from physjax.scene import Function, Particles, Scene, as_module
 
@@ -71,14 +72,33 @@ class Trajectory(eqx.Module):
         ok = concrete(self.ok)
         if ok is not None and ok.all():
             return jnp.full(ok.shape, -1, jnp.int32)
-        if self.scene is None or self.stepper is None:
-            raise ValueError(
-                "first_bad_step: this trajectory does not know its scene and method. Load it with scene= and method=."
-            )
+        self._known_scene("first_bad_step")
         watch = partial(_first_bad_step, steps=self.steps)
         for _ in range(self.first_step.ndim):  # runs that came out of vmap
             watch = jax.vmap(watch)
         return watch(self.scene, self.stepper, self.dt, self.first_step)
+
+    @property
+    def film(self) -> Scene:
+        """The scene with frames along a leading axis in each array that changed: its state, and what parts remember."""
+        return _remembering(self._known_scene("film"), self._states(), self.parts)
+
+    def crossing(self, surface: Any, *, direction: int | None = None) -> Crossing:
+        """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
+
+        `surface` is a height y [m], a number or one per lane; anything with a `gap(t, position)`, such as
+        `contacts.Plane`; or a function `(t, position) -> signed distance` [m], one for each lane, with t a scalar or per
+        lane. `direction` -1 looks for what goes from positive gaps to negative (downward), +1 for the opposite. The step
+        is found by stepping again between the frames, the moment in it along the method's own path: the error falls with
+        the method's order, however few frames were saved, and derivatives, forward and reverse, move the moment as well.
+
+        What starts on the surface does not cross it there; what bounces off a contact does not cross it. A crossing and
+        its return within one step are not seen, nor are those between two frames whose positions and velocities, by the
+        cubic through them, do not tell of it. Coupled nodes have their own moments each, at the cost of a few steps of
+        the whole scene for every node. Raises ValueError where the run does not know its scene and method.
+        """
+        self._known_scene("crossing")
+        return first_crossing(self, surface, direction)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the run as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent.
@@ -126,6 +146,14 @@ class Trajectory(eqx.Module):
             groups |= {"final_state": self.final_scene.state, "final_parts": memories(self.final_scene)}
         return groups
 
+    def _known_scene(self, what: str) -> Scene:
+        """The scene, if it is known with its method, so that it can be stepped."""
+        if self.scene is None or self.stepper is None:
+            raise ValueError(
+                f"{what}: this trajectory does not know its scene and method. Load it with scene= and method=."
+            )
+        return self.scene
+
     def _states(self) -> Particles:
         if self.state is None:
             raise AttributeError(
@@ -155,6 +183,13 @@ def memories(scene: Scene) -> tuple:
     return tuple(part for part in (*scene.forces, *scene.contacts) if _remembers(part))
 
 
+def _remembering(scene: Scene, state: Any, parts: tuple) -> Scene:
+    """The scene with another state, and with other memories in those of its parts that have some."""
+    parts = iter(parts)
+    renewed = lambda old: tuple(next(parts) if _remembers(part) else part for part in old)  # noqa: E731
+    return scene.having(state=state, forces=renewed(scene.forces), contacts=renewed(scene.contacts))
+
+
 def _remembers(part: Any) -> bool:
     return hasattr(part, "advance") or bool(getattr(part, "memory", ()))
 
@@ -168,9 +203,7 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
     state = parts = final_scene = None
     if scene is not None and ours:
         final_state = _filled("final_state", scene.state, arrays)
-        final_parts = iter(_filled("final_parts", memories(scene), arrays))
-        restore = lambda parts: tuple(next(final_parts) if _remembers(part) else part for part in parts)  # noqa: E731
-        final_scene = scene.having(state=final_state, forces=restore(scene.forces), contacts=restore(scene.contacts))
+        final_scene = _remembering(scene, final_state, _filled("final_parts", memories(scene), arrays))
         if final_state.position.shape != scene.state.position.shape:
             raise ValueError(
                 f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "

@@ -22,8 +22,10 @@ FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 
 FLOORS = (
-    {"vectors", "checks", "files", "lanes"},
+    {"vectors", "checks", "files", "lanes", "loops"},
+    {"roots"},
     {"scene"},
+    {"crossing"},
     {"trajectory", "pins"},
     {"physics", "stepping"},
     {"show"},

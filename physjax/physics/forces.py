@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from physjax.checks import quantity
 from physjax.physics.gravitation import Gravitation
+from physjax.physics.timed import Constant, Control, Kick, per_lane, share_before
 from physjax.scene import Field, Force, Function, Particles, loads
 from physjax.vectors import dot, norm, over, scale, spin, unit, upward
 
@@ -23,6 +24,7 @@ __all__ = [
     "Blast",
     "Buoyancy",
     "Constant",
+    "Control",
     "Gravitation",
     "Gravity",
     "Kick",
@@ -52,49 +54,6 @@ class Gravity(Field):
         return mass * self.g * state.position[..., self.up]
 
 
-class Constant(Force):
-    """The same force at all times: F = F₀ [N]."""
-
-    definite: ClassVar[bool] = True
-    force: Float[Array, "..."] = quantity("force", "N")
-
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """F₀ [N]."""
-        return over(self.force, state.velocity)
-
-    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
-        """-F₀·x [J]."""
-        return -dot(over(self.force, state.position), state.position)
-
-
-class Kick(Force):
-    """A force for a while, as when a ball is kicked: impulse [N s] = force × duration, from the time `at` [s] on.
-
-    A step feels its mean over the step, so that the whole impulse arrives under every method and at every step size.
-    A lane whose impulse is zero is not kicked.
-    """
-
-    impulse: Float[Array, "..."] = quantity("impulse", "N s")
-    at: Float[Array, "..."] = quantity("start of the kick", "s")
-    duration: Float[Array, "..."] = quantity("duration of the kick", "s", above=0)
-
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """impulse/duration while the kick lasts [N]."""
-        t = _per_lane(t, state)
-        lasts = (self.at <= t) & (t < self.at + self.duration)
-        return scale(jnp.where(lasts, 1 / self.duration, 0.0), over(self.impulse, state.velocity))
-
-    def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> Constant:
-        """The mean of the force over the step from t to t + dt."""
-        t, dt = _per_lane(t, state), _per_lane(dt, state)
-        share = _share_before(self.at + self.duration, t, dt) - _share_before(self.at, t, dt)
-        return Constant(scale(share / self.duration, over(self.impulse, state.velocity)))
-
-    def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
-        """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole kick."""
-        return self.at, self.at + self.duration
-
-
 class Blast(Force):
     """An explosion: away from the `center`, impulse J/(1 + (d/r)²) [N s] at the distance d, spread over a `duration` [s].
 
@@ -111,7 +70,7 @@ class Blast(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """J/(1 + (d/r)²)/duration away from the center while the blast lasts [N]."""
-        t = _per_lane(t, state)
+        t = per_lane(t, state)
         lasts = (self.at <= t) & (t < self.at + self.duration)
         return scale(jnp.where(lasts, 1 / self.duration, 0.0), self.received(state))
 
@@ -122,8 +81,8 @@ class Blast(Force):
 
     def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> "_SteadyBlast":
         """The mean in time of the force over the step from t to t + dt."""
-        t, dt = _per_lane(t, state), _per_lane(dt, state)
-        share = _share_before(self.at + self.duration, t, dt) - _share_before(self.at, t, dt)
+        t, dt = per_lane(t, state), per_lane(dt, state)
+        share = share_before(self.at + self.duration, t, dt) - share_before(self.at, t, dt)
         return _SteadyBlast(self, share / self.duration)
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
@@ -334,17 +293,3 @@ def _airspeed(state: Particles, wind: Array | None) -> Array:
 def _turning(omega: Array, r: Array) -> Array:
     """An angular velocity for every lane: a number in the plane, a vector in space."""
     return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else over(omega, r)
-
-
-def _per_lane(number: ArrayLike, state: Particles) -> Array:
-    """A number that every lane has in common, or the lanes of a scene, so that it meets numbers shaped like the lanes."""
-    number = jnp.asarray(number, state.dtype)
-    return number.reshape(number.shape + (1,) * (len(state.lanes) - number.ndim)) if number.ndim else number
-
-
-def _share_before(edge: Array, t: Array, dt: Array) -> Array:
-    """The share of the step from t to t + dt that lies before a time; exactly 0 or 1 if it is one of the step's ends."""
-    share = (edge - t) / dt
-    whole = jnp.round(share)
-    rounding = 4 * jnp.finfo(share.dtype).eps * (1 + jnp.abs(t) / dt)
-    return jnp.clip(jnp.where(jnp.abs(share - whole) <= rounding, whole, share), 0.0, 1.0)

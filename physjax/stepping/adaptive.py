@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
-from physjax.lanes import any_lane
+from physjax.lanes import any_lane, wide
 from physjax.scene import as_module
 from physjax.vectors import norm
 
@@ -75,7 +75,7 @@ class Adaptive(eqx.Module):
         else:
             end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
         ok = ~end.failed & ~end.going(dt)
-        state = jax.tree.map(lambda leaf: jnp.where(_wide(ok, leaf), leaf, jnp.nan), end.state)
+        state = jax.tree.map(lambda leaf: jnp.where(wide(ok, leaf), leaf, jnp.nan), end.state)
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
     def _attempt(self, system: Any, t: Any, dt: Any, floor: Any, ceiling: Any, walk: "_Walk") -> "_Walk":
@@ -96,7 +96,7 @@ class Adaptive(eqx.Module):
         # cut short by the end, a step says little about how long the next may be
         longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
         return _Walk(
-            state=jax.tree.map(lambda a, b: jnp.where(_wide(good, a), a, b), halves, walk.state),
+            state=jax.tree.map(lambda a, b: jnp.where(wide(good, a), a, b), halves, walk.state),
             elapsed=jnp.where(good, jnp.where(last, dt, walk.elapsed + h), walk.elapsed),
             h=jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
             accepted=walk.accepted + good.astype(jnp.int32),
@@ -142,7 +142,7 @@ class Adaptive(eqx.Module):
         size, speed = _size(state, tolerance, shape), _size(slope, tolerance, shape)
         small = 0.01 * jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1.0), 1e30)
         small = jnp.clip(small, FLOOR * dt, dt)
-        ahead = jax.tree.map(lambda y, k: y + _wide(small, y) * k, state, slope)
+        ahead = jax.tree.map(lambda y, k: y + wide(small, y) * k, state, slope)
         turn = jax.tree.map(lambda a, b: a - b, system.rate(t + small, ahead), slope)
         bend = jnp.maximum(_size(turn, tolerance, shape) / small, 1e-30)
         # half of y'' dt² is what a step of first order misses
@@ -239,11 +239,6 @@ def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
         return eqx.filter(after, eqx.is_array), told._replace(state=after.state)
 
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
-
-
-def _wide(number: Array, like: Array) -> Array:
-    """A number of each scene or lane, with the axes of an array of the state."""
-    return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))
 
 
 def _size(state: Any, tolerance: Any, shape: tuple) -> Array:

@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.lanes import FEWEST, in_pieces
+from physjax.loops import repeat, time_at
 from physjax.scene import Function, Scene, as_module
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
@@ -151,30 +152,6 @@ def _step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
     return scene.step(method, time_at(i, dt, scene.state.dtype), dt)
 
 
-def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
-    """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
-    if count == 1:
-        return step(first, carry)
-    inner = _near_root(count) if count > 16 else count
-    outer, rest = divmod(count, inner)
-
-    def run(carry, first, length):
-        return lax.scan(lambda c, i: (step(first + i, c), None), carry, jnp.arange(length, dtype=jnp.int32))[0]
-
-    if outer == 1 and not rest:
-        return run(carry, first, count)
-    chunk = jax.checkpoint(partial(run, length=inner), prevent_cse=False)
-    carry, _ = lax.scan(lambda c, i: (chunk(c, first + i * inner), None), carry, jnp.arange(outer, dtype=jnp.int32))
-    return run(carry, first + outer * inner, rest) if rest else carry
-
-
-def _near_root(count: int) -> int:
-    """A length for chunks of about √count: one that leaves no rest, if there is one, since a rest is compiled once more."""
-    root = math.isqrt(count)
-    exact = [length for length in range(root // 2, 2 * root + 1) if count % length == 0]
-    return min(exact, key=lambda length: abs(length - root), default=root)
-
-
 @partial(jax.jit, static_argnames=("frames",))
 def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: ArrayLike, frames: int) -> Any:
     """States at `frames` + 1 equally spaced times, with a number of steps between them that is data, not shape.
@@ -194,11 +171,6 @@ def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: Array
 
     _, states = lax.scan(frame, moving, jnp.arange(frames, dtype=jnp.int32))
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), scene.state, states)
-
-
-def time_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Array:
-    """Time is counted, t = i dt, never accumulated: accumulation drifts by a rounding error a step."""
-    return step.astype(dtype) * dt
 
 
 def _changing(scene: Scene, dt: ArrayLike) -> Any:

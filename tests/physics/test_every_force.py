@@ -29,6 +29,13 @@ CASES = {
     "Blast": Case(
         forces.Blast, {"impulse": 2.0, "reach": 0.7, "at": 0.3, "duration": 0.4}, {"center": [0.1, 0.2, -0.3]}, 3
     ),
+    "Control": Case(forces.Control, {"at": 0.3, "duration": 2.0}, {"values": [[2.0, 1.0], [-1.0, 3.0], [4.0, 0.5]]}, 2),
+    "Control, linear": Case(
+        lambda **n: forces.Control(**n, linear=True),
+        {"at": 0.3, "duration": 2.0},
+        {"values": [[2.0, 1.0], [-1.0, 3.0], [4.0, 0.5]]},
+        2,
+    ),
     "StokesDrag": Case(forces.StokesDrag, {"coefficient": 0.3}, WIND, 3),
     "StokesDrag in still air": Case(forces.StokesDrag, {"coefficient": 0.3}, {}, 2),
     "QuadraticDrag": Case(forces.QuadraticDrag, {"area": 0.1, "coefficient": 0.4, "density": 1.2}, WIND, 3),
@@ -92,7 +99,7 @@ def test_lanes_vmap_and_one_by_one_agree(case, shared):
 
 def smallest(case):
     """The force with all vectors zero, and all numbers that may be."""
-    given = {name: np.zeros(case.dim) for name in case.vectors} | case.numbers
+    given = {name: np.zeros(np.shape(vector)) for name, vector in case.vectors.items()} | case.numbers
     for name in case.numbers:
         try:
             case.build(**{**given, name: 0.0})
@@ -117,7 +124,7 @@ def test_value_and_derivatives_are_finite_at_rest_and_at_nothing(case):
 
         return jax.jvp(jax.value_and_grad(weighed), (scene,), (jax.tree.map(jnp.ones_like, scene),))
 
-    vectors = {name: np.zeros(case.dim) for name in case.vectors}
+    vectors = {name: np.zeros(np.shape(vector)) for name, vector in case.vectors.items()}
     with jax.enable_x64(False):  # float32, where a derivative leaves the range first
         nothing = jnp.zeros((1, case.dim))
         for force in (case.build(**case.numbers, **vectors), smallest(case)):

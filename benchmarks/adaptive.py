@@ -1,0 +1,189 @@
+"""What adaptive steps buy, and what they cost methods that owe their virtue to equal ones.
+
+    python benchmarks/adaptive.py [--quick] [--out DIR]
+
+Two bodies on ellipses, float64. (a) Eccentricity 0.9, two orbits: error at the end against evaluations of the force, for
+Runge-Kutta with equal steps and methods under error control; (b) tries that were rejected; (c) eccentricity 0.6, many
+orbits: the energy under leapfrog, verlet and Runge-Kutta, with equal steps and, at as many evaluations, with steps that
+follow an error. Counts, not seconds, so the machine does not matter.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import harness
+import jax
+import numpy as np
+from harness import Bar, tell
+
+from physjax import energy, methods, simulate
+from physjax.files import replacing
+from physjax.scenes import SCENES
+
+GOAL = 1e-6
+COLOURS = {"rk4": "#009E73", "verlet": "#0072B2", "leapfrog": "#CC79A7", "euler": "#D55E00"}
+SYMPLECTIC = ("leapfrog", "verlet")
+FRAMES = 20
+"""Moments of an orbit at which the energy is looked at."""
+TRIES = 3
+"""A try is a step whole and in halves."""
+
+
+class Settings(NamedTuple):
+    """Sizes of the studies."""
+
+    tolerances: tuple[float, ...]
+    counts: tuple[int, ...]
+    orbits: int
+    per_orbit: int
+
+
+FULL = Settings(tuple(10.0**-i for i in range(3, 12)), tuple(500 * 2**i for i in range(8)), 200, 1600)
+QUICK = Settings((1e-4, 1e-6, 1e-10), (500, 8000, 32_000), 10, 800)
+
+
+def closest(problem: Any, method: Callable, steps: int) -> float:
+    """Error of position after the whole duration [m]."""
+    run = simulate(problem.scene, method, dt=problem.duration / steps, steps=steps, save_every=steps)
+    exact = problem.exact(np.array([problem.duration])).position[0]
+    return float(np.abs(np.asarray(run.position[-1]) - exact).max())
+
+
+def adapted(problem: Any, method: Callable, tolerance: float, frames: int = 4) -> dict:
+    """Error, evaluations and rejections of a run under error control."""
+    chooser = methods.adaptive(method, tolerance, tolerance)
+    told = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
+    tries, rejected = int((told.accepted + told.rejected).sum()), int(told.rejected.sum())
+    exact = problem.exact(np.array([problem.duration])).position[0]
+    evaluations = TRIES * method.promises.evaluations * tries + 2 * frames
+    error = float(np.abs(np.asarray(told.state.position[-1]) - exact).max())
+    row = {"method": f"adaptive {method.__name__}", "tolerance": tolerance, "error": error, "evaluations": evaluations}
+    return row | {"tries": tries, "rejected": rejected}
+
+
+def work_and_error(size: Settings) -> list[dict]:
+    """Error against evaluations on the orbit of eccentricity 0.9."""
+    problem, rows = SCENES["kepler"](), []
+    for steps in size.counts:
+        evaluations = steps * methods.rk4.promises.evaluations
+        rows.append({"method": "rk4", "error": closest(problem, methods.rk4, steps), "evaluations": evaluations})
+    for method in (methods.rk4, methods.verlet):
+        # an order of two needs a great many steps for the finest
+        rows += [adapted(problem, method, t) for t in size.tolerances if method is methods.rk4 or t >= 1e-8]
+    return rows
+
+
+def evaluations_at(rows: list[dict], name: str) -> float:
+    """Evaluations at which a method's error falls to the goal, on a straight line between logarithms."""
+    points = sorted((r["evaluations"], r["error"]) for r in rows if r["method"] == name)
+    for (n0, e0), (n1, e1) in pairwise(points):
+        if e1 <= GOAL < e0:
+            return float(n0 * (n1 / n0) ** (np.log(e0 / GOAL) / np.log(e0 / e1)))
+    return float("nan")
+
+
+def energies(size: Settings) -> dict[str, dict[str, np.ndarray]]:
+    """Relative change of the energy over many orbits, equal steps beside steps that follow an error."""
+    problem = SCENES["kepler"](eccentricity=0.6, orbits=size.orbits)
+    start = float(energy.total(problem.scene, 0.0, problem.scene.state))
+    found = {}
+    for method in (methods.leapfrog, methods.verlet, methods.rk4):
+        chooser, spent = matched(problem, method, size)
+        frames = size.orbits * FRAMES
+        each = max(1, round(spent / method.promises.evaluations / frames))
+        steps = each * frames
+        change = lambda t, state: energy.total(problem.scene, t, state) / start - 1  # noqa: E731
+        equal = simulate(
+            problem.scene, method, dt=problem.duration / steps, steps=steps, save_every=each, record=change
+        )
+        follows = simulate(problem.scene, chooser, dt=problem.duration / frames, steps=frames, record=change)
+        found[method.__name__] = {"equal": np.asarray(equal.recorded)[1:], "adaptive": np.asarray(follows.recorded)[1:]}
+        tell(f"  {method.__name__}: {steps} equal steps beside {spent} evaluations under error control")
+    return found
+
+
+def matched(problem: Any, method: Callable, size: Settings) -> tuple[Any, int]:
+    """The method under error control with the tolerance that makes it cost nearly so many evaluations."""
+    low, high = -12.0, -2.0
+    goal, frames = size.orbits * size.per_orbit, size.orbits * FRAMES
+    for _ in range(10):
+        middle = (low + high) / 2
+        chooser = methods.adaptive(method, 10.0**middle, 10.0**middle)
+        told = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
+        spent = TRIES * method.promises.evaluations * int((told.accepted + told.rejected).sum())
+        low, high = (middle, high) if spent > goal or not told.ok.all() else (low, middle)
+    return chooser, spent
+
+
+def drift(change: np.ndarray) -> float:
+    """By how much the mean energy of the last tenth of a run differs from that of its first: 0 if it only swings."""
+    parts = np.array_split(change, 10)
+    return float(abs(parts[-1].mean() - parts[0].mean()))
+
+
+def draw(path: Any, rows: list[dict], found: dict, size: Settings, foot: str) -> None:
+    """Error against evaluations, and energy over orbits."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    looks = {"rk4": ("rk4", "o--"), "adaptive rk4": ("rk4", "s-"), "adaptive verlet": ("verlet", "s-")}
+    for name, (colour, line) in looks.items():
+        points = sorted((r["evaluations"], r["error"]) for r in rows if r["method"] == name)
+        label = name if name.startswith("adaptive") else f"{name}, equal steps"
+        left.loglog(*zip(*points, strict=True), line, color=COLOURS[colour], label=label)
+    left.set(xlabel="evaluations of the force", ylabel="error at the end [m]", title="two orbits of eccentricity 0.9")
+    left.legend(frameon=False)
+    left.grid(alpha=0.3)
+    for name, runs in found.items():
+        for kind, line in (("equal", "--"), ("adaptive", "-")):
+            worst = np.abs(runs[kind]).reshape(size.orbits, FRAMES).max(axis=-1)
+            label = f"{name}, {'equal steps' if kind == 'equal' else 'adaptive'}"
+            right.loglog(np.arange(1, size.orbits + 1), worst, line, color=COLOURS[name], label=label)
+    right.set(xlabel="orbit", ylabel="largest relative change of energy", title="eccentricity 0.6, at equal cost")
+    right.legend(frameon=False, fontsize=8)
+    right.grid(alpha=0.3)
+    figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
+    with replacing(path, "wb") as file:
+        figure.savefig(file, format="png", dpi=150)
+
+
+def main() -> None:
+    """Run all studies, print their tables, write the record and the chart."""
+    quick, folder = harness.options(__doc__)
+    size, about = QUICK if quick else FULL, harness.machine()
+    with jax.enable_x64(True):
+        tell("error against evaluations")
+        rows = work_and_error(size)
+        tell("energy over many orbits")
+        found = energies(size)
+    drifts = {name: {kind: drift(change) for kind, change in runs.items()} for name, runs in found.items()}
+    share = evaluations_at(rows, "adaptive rk4") / evaluations_at(rows, "rk4")
+    lost = min(drifts[name]["adaptive"] / drifts[name]["equal"] for name in SYMPLECTIC)
+    rejected = max(row["rejected"] / row["tries"] for row in rows if "tries" in row)
+    bars = [
+        Bar("evaluations at an error of 1e-6, adaptive / equal steps of rk4", share, "<=", 1 / 3),
+        Bar("largest share of rejected tries", rejected, "<=", 0.05),
+        Bar("drift of energy of symplectic methods, adaptive / equal steps [times]", lost, ">=", 10.0),
+    ]
+    print(harness.caption(about))
+    cells = [[r["method"], r.get("tolerance", "-"), r["error"], r["evaluations"], r.get("rejected", "-")] for r in rows]
+    harness.print_table(
+        "eccentricity 0.9, two orbits", ["", "tolerance", "error [m]", "evaluations", "rejected"], cells
+    )
+    cells = [[name, runs["equal"], runs["adaptive"]] for name, runs in drifts.items()]
+    title = f"drift of the energy over {size.orbits} orbits, relative"
+    harness.print_table(title, ["", "equal", "adaptive"], cells)
+    harness.print_bars(bars, quick)
+    record = {"benchmark": "adaptive", "quick": quick, "machine": about, "settings": size._asdict()}
+    record |= {"work_and_error": rows, "drift_of_energy": drifts}
+    record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
+    written, drawn = (harness.result_path(folder, "adaptive", quick, ending) for ending in ("json", "png"))
+    harness.write_json(written, record)
+    draw(drawn, rows, found, size, harness.caption(about))
+    print(f"\nwritten: {written} and {drawn.name}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,282 @@
+"""Where a run first crosses a surface: sought among its frames, then stepped to, to the accuracy of its method.
+
+Between two frames the run is stepped again from the first of them, so that it does not matter how few were saved. The
+moment within the step is a root along the method's own path; it moves with every number that the run depends on.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from physjax.checks import quantity
+from physjax.lanes import any_lane, wide
+from physjax.loops import repeat, time_at
+from physjax.roots import first_root
+from physjax.scene import as_module
+from physjax.vectors import norm
+
+TOGETHER = 64
+"""Nodes of a coupled scene whose crossings are sought at once, each with a copy of the scene."""
+
+
+class Crossing(NamedTuple):
+    """Time [s], position [m] and velocity [m/s] of each lane's first crossing; where it has none, `ok` False and NaN."""
+
+    time: Float[Array, "*lanes"]
+    position: Float[Array, "*lanes dim"]
+    velocity: Float[Array, "*lanes dim"]
+    ok: Bool[Array, "*lanes"]
+
+
+class Height(eqx.Module):
+    """All places at one height y [m], a number or one per lane; in one dimension that is the coordinate itself."""
+
+    height: Float[Array, "..."] = quantity("height", "m")
+
+    def gap(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+        """How far above [m]."""
+        return position[..., min(1, position.shape[-1] - 1)] - self.height.astype(position.dtype)
+
+
+def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
+    """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
+    if direction not in (None, 1, -1):
+        raise ValueError(
+            f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
+        )
+    if not hasattr(surface, "gap"):
+        surface = as_module(surface) if callable(surface) else Height(surface)
+    return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
+
+
+@eqx.filter_jit
+def _crossing(run: Any, surface: Any, way: Array) -> Crossing:
+    find = lambda run: _crossing_of_one(run, surface, way)  # noqa: E731
+    for _ in range(run.first_step.ndim):  # runs that came out of vmap
+        find = jax.vmap(find)
+    return find(run)
+
+
+def _crossing_of_one(run: Any, surface: Any, way: Array) -> Crossing:
+    scene, gap = run.scene, _checked_gap(surface, run.scene)
+    if not scene.couples:
+        return _unit_crossing(run, gap, way, lambda leaf: leaf)
+
+    def of_node(n):
+        return _unit_crossing(run, lambda t, x: gap(t, x)[..., n], way, lambda leaf: leaf[..., n, :])
+
+    # a node's moment is its own, and the whole scene is stepped to it
+    count = scene.state.lanes[-1]
+    nodes = jnp.arange(count, dtype=jnp.int32)
+    few = count <= TOGETHER
+    found = jax.vmap(of_node)(nodes) if few else lax.map(jax.checkpoint(of_node), nodes, batch_size=TOGETHER)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(scene.status_shape)), found)
+
+
+class _Place(NamedTuple):
+    """Where a crossing was found: in the step that begins so many steps after a frame; the gaps at both its ends."""
+
+    frame: Array
+    step: Array
+    before: Array
+    after: Array
+    found: Array
+
+
+class _Replay(NamedTuple):
+    """A run to be stepped again: what changes in it at every frame, its step, its clock and its gap as functions.
+
+    Every number has the shape of what is stepped on its own: a lane, or a scene of coupled ones.
+    """
+
+    frames: Any
+    step: Callable
+    gap: Callable
+    first_step: Array
+    every: int
+    dt: Array
+
+    def held(self) -> "_Replay":
+        """The same without derivatives."""
+        moving = self.at(jnp.zeros(self.dt.shape, jnp.int32))
+        step = _constant(self.step, moving, self.dt, self.dt)
+        gap = _constant(self.gap, self.dt, moving.state.position)
+        return _Replay(
+            lax.stop_gradient(self.frames), step, gap, self.first_step, self.every, lax.stop_gradient(self.dt)
+        )
+
+    def time(self, frame: Array, i: ArrayLike) -> Array:
+        """When the step begins that comes i steps after a frame [s]."""
+        return time_at(self.first_step + frame * self.every + i, self.dt, self.dt.dtype)
+
+    def at(self, frame: Array) -> Any:
+        """What changes, as it was at a frame of its own for each lane."""
+        return jax.tree.map(lambda leaf: _picked(leaf, frame), self.frames)
+
+    def signed(self, t: Array, moving: Any) -> Array:
+        """The gap; zero where it is less than rounding, or what starts on the surface would cross it at once."""
+        value, x = self.gap(t, moving.state.position), moving.state.position
+        size = jnp.broadcast_to(norm(x), value.shape) if x.ndim == value.ndim + 1 else jnp.max(norm(x), axis=-1)
+        return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(x.dtype).eps) * size, 0.0, value)
+
+
+def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossing:
+    """The first crossing of every lane, or, where they are coupled, of one node in every scene, which `own` picks."""
+    replay = _replay(run, gap)
+    place = _search(replay.held(), way)
+    moving = replay.at(place.frame)
+
+    def forward(i, moving):
+        after = replay.step(moving, replay.time(place.frame, i), replay.dt)
+        return jax.tree.map(lambda a, b: jnp.where(wide(i < place.step, a), a, b), after, moving)
+
+    if replay.every > 1:
+        moving = repeat(forward, moving, jnp.zeros((), jnp.int32), replay.every - 1)
+    begun = replay.time(place.frame, place.step)
+    side = jnp.where(place.before < 0, -1.0, 1.0).astype(replay.dt.dtype)
+
+    def left(duration):
+        return side * replay.gap(begun + duration, replay.step(moving, begun, duration).state.position)
+
+    numbers, left = _hoisted(left, replay.dt)  # the root moves with all that the path depends on
+    tolerance = 4 * float(jnp.finfo(replay.dt.dtype).eps) * replay.dt
+    values = (side * place.before, side * place.after)
+    search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
+    duration = first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
+    x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
+    told = lambda leaf: jnp.where(wide(place.found, leaf), leaf, jnp.nan)  # noqa: E731
+    return Crossing(told(begun + duration), told(x), told(v), place.found)
+
+
+def _replay(run: Any, gap: Callable) -> _Replay:
+    """The run made ready to be stepped again."""
+    scene, film, shape = run.scene, run.film, run.scene.status_shape
+    changes = jax.tree.map(lambda a, b: a.ndim < b.ndim, scene, film)
+    frames, (first, still) = eqx.filter(film, changes), eqx.partition(scene, changes)
+    _demand_apart(first, shape)
+    dt = jnp.broadcast_to(run.dt, shape)
+
+    def step(moving, t, dt):
+        return eqx.filter(eqx.combine(moving, still).step(run.stepper, t, dt), changes)
+
+    return _Replay(frames, step, gap, run.first_step, run.save_every, dt)
+
+
+def _search(replay: _Replay, way: Array) -> _Place:
+    """Frame and step of the first crossing, by stepping again through the frames between which there may be one."""
+    shape, zero = replay.dt.shape, jnp.zeros(replay.dt.shape, jnp.int32)
+    hopes = _hopes(replay, way)
+    numbers = jnp.arange(len(hopes), dtype=jnp.int32).reshape(-1, *(1 for _ in shape))
+    ahead = lambda cursor: hopes & (numbers >= cursor[None])  # noqa: E731
+
+    def going(carry):
+        cursor, place = carry
+        return any_lane(jnp.any(ahead(cursor), axis=0) & ~place.found)
+
+    def look(carry):
+        cursor, place = carry
+        frame = jnp.argmax(ahead(cursor), axis=0).astype(jnp.int32)
+        seen = _stepped_through(replay, frame, way)
+        new = seen.found & jnp.any(ahead(cursor), axis=0) & ~place.found
+        return frame + 1, jax.tree.map(lambda a, b: jnp.where(new, a, b), seen, place)
+
+    nothing = jnp.zeros(shape, replay.dt.dtype)
+    place = _Place(zero, zero, nothing + 1.0, nothing - 1.0, jnp.zeros(shape, bool))
+    return lax.while_loop(going, look, (zero, place))[1]
+
+
+def _stepped_through(replay: _Replay, frame: Array, way: Array) -> _Place:
+    """The first step after a frame at whose end the gap has another sign than at its start."""
+
+    def one(i, carry):
+        moving, now, place = carry
+        t = replay.time(frame, i)
+        moving = replay.step(moving, t, replay.dt)
+        after = replay.signed(t + replay.dt, moving)
+        here = _crosses(now, after, way) & ~place.found
+        new = _Place(frame, jnp.full_like(frame, i), now, after, here)
+        return moving, after, jax.tree.map(lambda a, b: jnp.where(here, a, b), new, place)
+
+    moving = replay.at(frame)
+    now = replay.signed(replay.time(frame, 0), moving)
+    start = (moving, now, _Place(frame, jnp.zeros_like(frame), now, now, jnp.zeros(now.shape, bool)))
+    return lax.fori_loop(0, replay.every, one, start)[2]
+
+
+def _hopes(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:
+    """Between which frames there may be a crossing: where the cubic through them changes its sign, which may be at neither."""
+
+    def gap_and_rate(frame, moving):
+        t, one = replay.time(jnp.full(replay.dt.shape, frame), 0), jnp.ones_like(replay.dt)
+        _, rate = jax.jvp(replay.gap, (t, moving.state.position), (one, moving.state.velocity))
+        return replay.signed(t, moving), replay.every * replay.dt * rate
+
+    numbers = jnp.arange(len(replay.frames.state.position), dtype=jnp.int32)
+    gap, rate = jax.vmap(gap_and_rate)(numbers, replay.frames)
+    d0, d1, r0, r1 = gap[:-1], gap[1:], rate[:-1], rate[1:]
+    b, a = 3 * (d1 - d0) - 2 * r0 - r1, r0 + r1 - 2 * (d1 - d0)
+    root = b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(b * b - 3 * a * r0, 0.0))
+    # the two places where it is level, by quotients that do not cancel; what is no number there is no place
+    level = [jnp.clip(jnp.nan_to_num(s, nan=1.0), 0.0, 1.0) for s in (-root / (3 * a), -r0 / root)]
+    middle = [d0 + s * (r0 + s * (b + s * a)) for s in (jnp.minimum(*level), jnp.maximum(*level))]
+    ends = [d0, *middle, d1]
+    pieces = [_crosses(before, after, way) for before, after in pairwise(ends)]
+    return jnp.any(jnp.stack([_crosses(d0, d1, way), *pieces]), axis=0)
+
+
+def _crosses(before: Array, after: Array, way: Array) -> Array:
+    """Whether a gap changes its sign in the wanted direction; what starts at zero does not cross, what arrives there does."""
+    falls, rises = (before > 0) & (after <= 0), (before < 0) & (after >= 0)
+    return (falls & (way <= 0)) | (rises & (way >= 0))
+
+
+def _constant(function: Callable, *examples: Any) -> Callable:
+    """The function without derivatives by what it closes over."""
+    numbers, pure = _hoisted(function, *examples)
+    return partial(pure, lax.stop_gradient(numbers))
+
+
+def _hoisted(function: Callable, *examples: Any) -> tuple[Any, Callable]:
+    """Every array that a function closes over, and the function with these as its first argument."""
+    numbers, rest = eqx.partition(
+        eqx.filter_closure_convert(lambda *arguments: function(*arguments), *examples), eqx.is_array
+    )
+    return numbers, lambda numbers, *arguments: eqx.combine(numbers, rest)(*arguments)
+
+
+def _picked(leaf: Array, frame: Array) -> Array:
+    """The entry of each lane at a frame of its own."""
+    if not frame.ndim:
+        return leaf[frame]
+    index = frame.reshape(1, *frame.shape, *(1 for _ in range(leaf.ndim - 1 - frame.ndim)))
+    return jnp.take_along_axis(leaf, index, axis=0)[0]
+
+
+def _checked_gap(surface: Any, scene: Any) -> Callable:
+    """The surface's gap, if it gives a number for each lane."""
+    gap = getattr(surface, "gap", surface)
+    t = jnp.zeros(scene.status_shape, scene.state.dtype)
+    seen = jax.eval_shape(gap, t, scene.state.position)
+    if seen.shape != scene.state.lanes:
+        raise ValueError(
+            f"crossing: the surface's gap(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
+            "one distance [m] for each, e.g. position[..., 1] - 2.0."
+        )
+    return gap
+
+
+def _demand_apart(changing: Any, shape: tuple[int, ...]) -> None:
+    """Raise a ValueError if lanes share something that changes: they are stepped from different frames."""
+    if any(leaf.shape[: len(shape)] != shape for leaf in jax.tree.leaves(changing)):
+        raise ValueError(
+            "crossing: a part of the scene remembers something that its lanes share, but each lane is stepped again from a "
+            "frame of its own. Give what it remembers an entry for each lane, or run the lanes one by one."
+        )

@@ -1,0 +1,65 @@
+"""Roots lane by lane, which move with what the function depends on."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from physjax.lanes import any_lane, apart, loop
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def first_root(function: Callable, arguments: Any, search: tuple) -> Array:
+    """A root x of `function(x, *arguments)` per lane, which moves with the arguments: dx = -∂f/(∂f/∂x).
+
+    `search` holds the bracket, a guess of the values at its ends (positive at the first, negative at the last), which
+    lanes are wanted, and the tolerance. A lane whose function does not fall there keeps its root where it is.
+    """
+    return _bracketed_root(lambda x: function(x, *arguments), *search)
+
+
+@first_root.defjvp
+def _first_root_jvp(function, primals, tangents):
+    (arguments, search), (moves, _) = primals, tangents
+    x = first_root(function, arguments, search)
+    _, shift = jax.jvp(lambda *arguments: function(x, *arguments), arguments, moves)
+    _, slope = jax.jvp(lambda x: function(x, *arguments), (x,), (jnp.ones_like(x),))
+    falls = search[2] & (slope < 0)
+    return x, jnp.where(falls, shift, 0.0) / jnp.where(falls, -slope, 1.0)
+
+
+def _bracketed_root(
+    function: Callable, bracket: tuple[Array, Array], values: tuple[Array, Array], active: Array, tolerance: Array
+) -> Array:
+    """Chandrupatla's method: inverse quadratic interpolation where it is safe, else bisection.
+
+    T. R. Chandrupatla, Advances in Engineering Software 28, 1997.
+    """
+    (low, high), (above, below) = bracket, values
+    tiny = float(jnp.finfo(low.dtype).tiny)
+    above, below = jnp.maximum(above, tiny), jnp.minimum(below, -tiny)
+
+    def going(carry):
+        return any_lane(carry[-1])
+
+    def closer(carry):
+        a, b, fa, fb, share, going = carry
+        x = a + share * (b - a)
+        fx = apart(going, lambda: function(x), x)
+        same = (fx < 0) == (fa < 0)
+        c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
+        b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
+        width = jnp.abs(b - x)
+        limit = jnp.where(width > 0, tolerance / jnp.where(width > 0, width, 1.0), 1.0)
+        xi, phi = (x - b) / (c - b), (fx - fb) / (fc - fb)
+        smooth = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
+        inverse = fx / (fb - fx) * fc / (fb - fc) + (c - x) / (b - x) * fx / (fc - fx) * fb / (fc - fb)
+        share = jnp.clip(jnp.where(smooth, inverse, 0.5), limit, 1 - limit)
+        after = (x, b, fx, fb, share, going & (limit <= 0.5) & (fx != 0))
+        return tuple(jnp.where(going, new, old) for new, old in zip(after, carry, strict=True))
+
+    start = (high, low, below, above, below / (below - above), active & (high > low))
+    return loop(going, closer, start, most=200)[0]
