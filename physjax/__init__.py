@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from physjax.physics import contacts, lattices, springs
     from physjax.show import animate, plot
     from physjax.study import accuracy, energy, projectile, stability
+    from physjax.study.aim import aim_at
+    from physjax.study.solve import minimise, solve
 
 __all__ = [
     "Contact",
@@ -26,6 +28,7 @@ __all__ = [
     "Scene",
     "Trajectory",
     "accuracy",
+    "aim_at",
     "animate",
     "contacts",
     "energy",
@@ -33,12 +36,14 @@ __all__ = [
     "lattices",
     "loads",
     "methods",
+    "minimise",
     "ode_term",
     "plot",
     "projectile",
     "reference",
     "scenes",
     "simulate",
+    "solve",
     "springs",
     "stability",
 ]
@@ -57,11 +62,18 @@ _LATER = {
     "springs": "physjax.physics.springs",
     "stability": "physjax.study.stability",
 }
+_VERBS_LATER = {
+    "aim_at": "physjax.study.aim",
+    "minimise": "physjax.study.solve",
+    "solve": "physjax.study.solve",
+}
 
 
 def __getattr__(name: str) -> object:
     if name in _LATER:
         return import_module(_LATER[name])
+    if name in _VERBS_LATER:
+        return getattr(import_module(_VERBS_LATER[name]), name)
     raise AttributeError(f"module 'physjax' has no attribute {name!r}")
 
 
