@@ -13,21 +13,20 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, positive_integer, real_array, real_quantity
+from physjax.checks import concrete, demand, positive_integer, real_quantity
 from physjax.scene import Scene, as_module
 from physjax.stepping.methods import rk4
 from physjax.study.shooting import Launch, Range, find, nearest
 from physjax.trajectory import Trajectory
-from physjax.vectors import dot, norm, scale
+from physjax.vectors import dot, norm
 
 __all__ = ["Aimed", "Shot", "aim_at"]
 
-STEPS = 128
+STEPS = 200
 """Steps of a flight unless told otherwise."""
 ROUNDINGS = 512
 """A target that is missed by no more than so many roundings of the flight's extent is hit."""
@@ -190,7 +189,9 @@ def _solved_by_lane(linear: Callable, b: Array) -> Array:
     """The solution of linear(x) = b, a small system for each lane; zero where that is singular."""
     size = b.shape[-1]
     rows = jnp.eye(size, dtype=b.dtype)
-    columns = jax.vmap(linear)(jnp.broadcast_to(rows.reshape((size,) + (1,) * (b.ndim - 1) + (size,)), (size, *b.shape)))
+    columns = jax.vmap(linear)(
+        jnp.broadcast_to(rows.reshape((size,) + (1,) * (b.ndim - 1) + (size,)), (size, *b.shape))
+    )
     matrix = jnp.moveaxis(columns, 0, -1)
     probe = jnp.linalg.solve(lax.stop_gradient(matrix), jnp.ones((*b.shape, 1), b.dtype))
     sound = jnp.all(jnp.isfinite(probe), axis=(-2, -1))
@@ -210,7 +211,11 @@ def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:
     turns = (v0 > 0) & (v1 < 0)
     share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.0)
     rest = 1 - share
-    top = rest**2 * (1 + 2 * share) * y0 + share**2 * (1 + 2 * rest) * y1 + share * rest * dt * (rest * v0 - share * v1)
+    top = (
+        rest**2 * (1 + 2 * share) * y0
+        + share**2 * (1 + 2 * rest) * y1
+        + share * rest * dt[None] * (rest * v0 - share * v1)
+    )
     return jnp.maximum(jnp.max(top, axis=0), height[-1])
 
 
@@ -250,8 +255,8 @@ def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Ran
         )
     shape = (lanes or here) + position.shape[-1:]
     position, target = jnp.broadcast_to(position, shape), jnp.broadcast_to(target, shape)
-    away = concrete(norm(target - position))
-    if away is not None:
-        demand("distance from launch to target [m]", away, away > 0, "a target away from the launch")
+    away = norm(target - position)
+    if concrete(away) is not None:
+        demand("distance from launch to target [m]", away, concrete(away) > 0, "a target away from the launch")
     state = type(scene.state)(position, jnp.broadcast_to(scene.state.velocity, shape))
     return Range(scene.having(state=state), target, as_module(method), steps)

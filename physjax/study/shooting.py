@@ -23,10 +23,8 @@ from physjax.stepping.simulate import sample, simulate
 from physjax.trajectory import Trajectory
 from physjax.vectors import components, cross, dot, norm, scale, stacked, turn_left, unit
 
-MOST = 40
-"""Steps of a search after which it is given up."""
-SMALL = 1e-7
-"""Turns [rad] too small to go on with: the distance is flat where it is least."""
+MOST, MOST_DOWNHILL = 40, 100
+"""Steps of a search, and of a descent to the nearest miss, after which it is given up."""
 COARSE = 16
 """Steps of a flight while the shot is still far from its target."""
 FARTHEST = math.e
@@ -71,8 +69,8 @@ class Range(eqx.Module):
         """
         if steps is None:
             return self.flight(launch).final_scene.state.position - self.target
-        last = sample(self.fired(launch.velocity), self.method, launch.time / steps, steps, 1)
-        return last.position[1] - self.target
+        dt = launch.time / steps.astype(launch.time.dtype)
+        return sample(self.fired(launch.velocity), self.method, dt, steps, 1).position[1] - self.target
 
     def sensitivity(self, launch: Launch, directions: list[Launch], steps: Array | None) -> tuple[Array, list[Array]]:
         """The miss [m], and its derivative along each direction."""
@@ -124,7 +122,8 @@ def find(
     guess = first_guess(shots, speed)
     # a step from so near leads to the last digits where convergence is quadratic
     enough = float(jnp.finfo(guess.time.dtype).eps) ** (0.5 if speed is not None else 0.75)
-    phases = (jnp.array([min(COARSE, shots.steps), shots.steps]), jnp.array([1e-3, enough], guess.time.dtype))
+    steps = jnp.array([min(COARSE, shots.steps), shots.steps], jnp.int32)
+    phases = (steps, jnp.array([1e-3, enough], guess.time.dtype))
 
     def phase(search, precision):
         sound = jnp.isfinite(search.launch.time) & jnp.isfinite(norm(search.launch.velocity))
@@ -132,7 +131,7 @@ def find(
             launch=Launch(*(_chosen(sound, *both) for both in zip(search.launch, guess, strict=True))),
             going=jnp.ones_like(search.going),
         )
-        return _repeated(partial(_closer, late, precision), search, shots, speed), None
+        return _repeated(partial(_closer, late, precision), search, shots, speed, MOST), None
 
     nothing = jnp.zeros_like(guess.time)
     search, _ = lax.scan(phase, _Search(guess, nothing, nothing, nothing < 0), phases)
@@ -149,7 +148,7 @@ def _closer(
     return _Search(launch, missing, moved, ~(jnp.maximum(jnp.abs(moved), correction) <= enough))
 
 
-def _repeated(closer: Callable, begin: Any, shots: Range, speed: Array | None) -> Any:
+def _repeated(closer: Callable, begin: Any, shots: Range, speed: Array | None, most: int) -> Any:
     """`closer(search, shots, speed)` again and again for the lanes that are `going`: a few hard ones hold up no others."""
     # a plain function may hold arrays of its own that cannot be cut
     cut = not any(isinstance(force, Function) for force in shots.scene.forces)
@@ -161,7 +160,7 @@ def _repeated(closer: Callable, begin: Any, shots: Range, speed: Array | None) -
     def body(search):
         return on_flagged(once, search.going, search, shots, speed, cut=cut)
 
-    return loop(lambda search: any_lane(search.going), body, begin, most=MOST)
+    return loop(lambda search: any_lane(search.going), body, begin, most=most)
 
 
 def _next_launch(
@@ -180,7 +179,9 @@ def _next_launch(
     if speed is None:
         missing = 0.5 * jnp.log(a / b)
         # the secant through this point and the last, since v(u) bends more with drag than without
-        bends = jnp.where(search.moved != 0, (search.missing - missing) / jnp.where(search.moved != 0, search.moved, 1), 1)
+        bends = jnp.where(
+            search.moved != 0, (search.missing - missing) / jnp.where(search.moved != 0, search.moved, 1), 1
+        )
         change = missing / jnp.clip(bends, 0.3, 10.0)
     else:
         middle = jnp.maximum(speed * speed - 2 * both, 2 * a * b)
@@ -208,7 +209,7 @@ def nearest(shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: 
     Unknown are the direction, as turns about it, and the logarithm of the flight time. Only for the `wanted` lanes.
     """
     still, zero = jnp.zeros_like(start.time), jnp.zeros_like(start.velocity)
-    steps = jnp.array(shots.steps)
+    steps, least = jnp.array(shots.steps, jnp.int32), 0.1 * float(jnp.finfo(still.dtype).eps) ** 0.5
 
     def closer(now, shots, speed):
         step = [jnp.clip(part, -0.5, 0.5) for part in components(_damped(now.slopes, now.miss, now.damping))]
@@ -219,9 +220,9 @@ def nearest(shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: 
         directions = [Launch(scale(speed, turn), still) for turn in tangents(velocity)]
         miss, slopes = shots.sensitivity(tried, [*directions, Launch(zero, tried.time)], steps)
         better = norm(miss) < now.distance
-        small = norm(stacked(step)) <= jnp.where(jnp.isfinite(now.distance), SMALL, -1.0)
-        after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.1 * now.damping, now.going)
-        worse = now._replace(damping=10.0 * now.damping)
+        small = (norm(stacked(step)) <= least) & jnp.isfinite(now.distance)
+        after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.going)
+        worse = now._replace(damping=3.0 * now.damping)
         after = jax.tree.map(lambda new, old: _chosen(better, new, old), after, worse)
         return after._replace(going=~small & (after.damping < 1e8))
 
@@ -229,7 +230,7 @@ def nearest(shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: 
     axes = tuple(jnp.broadcast_to(row, zero.shape) for row in jnp.eye(zero.shape[-1], dtype=zero.dtype))
     start = Launch(scale(speed, unit(start.velocity)), start.time)
     begin = _Descent(start, still + jnp.inf, zero, axes, still + 1e-2, wanted)
-    return _repeated(closer, begin, shots, speed).launch
+    return _repeated(closer, begin, shots, speed, MOST_DOWNHILL).launch
 
 
 def _damped(slopes: tuple[Array, ...], miss: Array, damping: Array) -> Array:

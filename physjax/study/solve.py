@@ -54,10 +54,10 @@ def solve(
 ) -> Solution:
     """A root of `residual(value)` or, where there are more equations than unknowns, the least of its squares.
 
-    As many equations as unknowns: Newton's method in a trust region (Powell's dog leg), and plain Newton steps for the
-    last digits; `ok` says that the residual vanishes. More equations: Levenberg and Marquardt's method. The value stays
-    between `lower` and `upper`, numbers or pytrees like the guess, which must lie strictly between them. The search ends
-    where a step changes value and residual by less than `atol + rtol·|·|`, each √eps of the dtype unless given.
+    The method of Levenberg and Marquardt, and with as many equations as unknowns Newton's from there to the last digits;
+    `ok` then says that the residual vanishes. The value stays between `lower` and `upper`, numbers or pytrees like the
+    guess, which must lie strictly between them. The search ends where a step changes value and residual by less than
+    `atol + rtol·|·|`, each √eps of the dtype unless given.
 
     Raises ValueError or TypeError for guesses, bounds and tolerances that cannot be, and for fewer equations than
     unknowns.
@@ -77,15 +77,20 @@ def solve(
             f"solve: got {count} equations for {start.size} unknowns, expected at least as many. Leave unknowns out, or "
             "say with minimise which of the many answers is wanted."
         )
-    if count > start.size:
-        found = optimistix.least_squares(equations, optimistix.LevenbergMarquardt(rtol, atol), start, **limits)
-        inner, ok = found.value, found.result == optimistix.RESULTS.successful
+    square = count == start.size
+    searched = _frozen(equations, start) if square else equations
+    safe = optimistix.LevenbergMarquardt(rtol, atol)
+    found = optimistix.least_squares(searched, safe, start, **limits)
+    if square:
+        newton = optimistix.Newton(rtol, atol)
+        root = optimistix.root_find(equations, newton, found.value, max_steps=POLISH, throw=False).value
+        left = lambda at: jnp.max(jnp.abs(searched(lax.stop_gradient(at), None)))  # noqa: E731
+        vanishing = atol + rtol * left(start)
+        # the derivatives are those of the Newton step: the search's would take second derivatives of the equations
+        inner = jnp.where(left(root) <= jnp.maximum(left(found.value), vanishing), root, found.value)
+        ok = left(inner) <= vanishing
     else:
-        frozen = _frozen(equations, start)
-        found = optimistix.root_find(frozen, optimistix.Dogleg(rtol, atol), start, **limits)
-        inner = _polished(equations, frozen, found.value, rtol, atol)
-        begun, left = (jnp.max(jnp.abs(frozen(at, None))) for at in (start, lax.stop_gradient(inner)))
-        ok = left <= atol + rtol * begun
+        inner, ok = found.value, found.result == optimistix.RESULTS.successful
     value = box.value(inner)
     return Solution(value, residual(value), ok & jnp.all(jnp.isfinite(inner)), found.stats["num_steps"])
 
@@ -115,7 +120,9 @@ def minimise(
 
     shape = jax.eval_shape(objective, start, None)
     if getattr(shape, "shape", None) != ():
-        raise ValueError(f"minimise: got a cost of {shape}, expected one number. Sum up, or use solve for least squares.")
+        raise ValueError(
+            f"minimise: got a cost of {shape}, expected one number. Sum up, or use solve for least squares."
+        )
     limits = {"max_steps": positive_integer("max_steps", max_steps), "throw": False}
     found = optimistix.minimise(objective, optimistix.BFGS(rtol, atol), start, **limits)
     value = box.value(found.value)
@@ -128,18 +135,6 @@ def _frozen(equations: Callable, start: Array) -> Callable:
     """The equations without derivatives in what they close over, so that none are carried through the search."""
     closed = eqx.filter_closure_convert(equations, start, None)
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, closed)
-
-
-def _polished(equations: Callable, frozen: Callable, near: Array, rtol: float, atol: float) -> Array:
-    """The root next to a near one, with its derivatives; the near one itself where Newton's method leads elsewhere.
-
-    The derivatives of the safe search would take second derivatives of the equations and square their condition.
-    """
-    import optimistix
-
-    root = optimistix.root_find(equations, optimistix.Newton(rtol, atol), near, max_steps=POLISH, throw=False).value
-    before, after = (jnp.max(jnp.abs(frozen(at, None))) for at in (near, lax.stop_gradient(root)))
-    return jnp.where(after <= before, root, near)
 
 
 class _Box(NamedTuple):
@@ -162,9 +157,7 @@ class _Box(NamedTuple):
         between = low + 0.5 * (high - low) * (jnp.sin(inner) + 1)
         away = self.unit * (jnp.sqrt(inner * inner + 1) - 1)
         above, below = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        return self.shaped(
-            jnp.where(both, between, jnp.where(above, low + away, jnp.where(below, high - away, inner)))
-        )
+        return self.shaped(jnp.where(both, between, jnp.where(above, low + away, jnp.where(below, high - away, inner))))
 
     def inner(self, value: Array) -> Array:
         """The unbounded numbers of a flat value strictly between the bounds."""

@@ -10,6 +10,7 @@ import pytest
 from physjax import Particles, Scene, forces, methods, minimise, simulate, solve
 from physjax.study import projectile
 
+
 def landing(angle, time, speed=30.0):
     """Where a shot is after a time, simulated."""
     velocity = speed * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
@@ -52,6 +53,10 @@ def test_second_derivatives_of_a_root():
     assert curvature == pytest.approx(-2 / 9 * 2.0 ** (-5 / 3), rel=1e-12)
 
 
+def test_a_guess_that_is_the_root_has_its_derivative():
+    assert jax.grad(lambda a: solve(lambda x: x**3 - a, 1.0).value)(jnp.asarray(1.0)) == pytest.approx(1 / 3, rel=1e-12)
+
+
 def test_lanes_of_a_batch_fail_alone(compiled_hit):
     targets = jnp.array([[40.0, 0.0], [400.0, 0.0], [jnp.nan, 0.0], [60.0, 5.0]])
     found = jax.vmap(compiled_hit)(targets)
@@ -61,7 +66,7 @@ def test_lanes_of_a_batch_fail_alone(compiled_hit):
 
 
 def test_where_newton_alone_runs_away():
-    """atan(x) = 0 from x = 3: Newton's steps grow without end; within a trust region they do not."""
+    """atan(x) = 0 from x = 3: Newton's steps grow without end; damped ones do not."""
     found = solve(jnp.arctan, 3.0)
     assert found.ok
     assert abs(found.value) < 1e-15
