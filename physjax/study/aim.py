@@ -18,8 +18,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, demand, positive_integer, real_quantity
+from physjax.physics.impact import impact
 from physjax.scene import Scene, as_module
 from physjax.stepping.methods import rk4
+from physjax.study.bounced import find_bounced
 from physjax.study.shooting import Launch, Range, find, nearest
 from physjax.trajectory import Trajectory
 from physjax.vectors import dot, norm
@@ -93,6 +95,7 @@ def aim_at(
     target: ArrayLike,
     *,
     speed: ArrayLike | None = None,
+    bounces: int = 0,
     method: Callable = rk4,
     steps: int = STEPS,
 ) -> Aimed:
@@ -101,12 +104,15 @@ def aim_at(
     The direction of launch is free; of the state's velocity nothing is used. Without `speed` the least speed that hits
     is found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
     angle and flight time are solved for together, to the last digits, so that the error left is the method's own.
-    Contacts count as obstacles. A target out of reach gives `ok` False and the nearest miss. Works under `jit`, `vmap`,
-    and any derivative with respect to the target, the speed and every number of the scene.
+    Contacts are obstacles, unless the target is to be hit after `bounces` impacts on them (`contacts.impact`). Then a
+    fan of directions is tried: `low` is the soonest hit that it leads to, `high` the latest. A target out of reach gives
+    `ok` False and the nearest miss. Works under `jit`, `vmap`, and any derivative with respect to the target, the speed
+    and every number of the scene.
 
     Raises ValueError or TypeError for a speed <= 0, a target at the start, a launch that is not free.
     """
     shots = _range(scene, target, method, steps)
+    bounces = _checked_bounces(bounces, speed, shots.scene)
     if speed is not None:
         speed = real_quantity("speed [m/s]", speed, above=0).astype(shots.target.dtype)
         if speed.shape not in ((), shots.target.shape[:-1]):
@@ -114,26 +120,28 @@ def aim_at(
                 f"speed [m/s]: got shape {speed.shape}, expected () or {shots.target.shape[:-1]}, one for each target."
             )
         speed = jnp.broadcast_to(speed, shots.target.shape[:-1])
-    low, high = _both_arcs(shots, speed)
-    return Aimed(low, high, shots)
+    return Aimed(*_both_arcs(shots, speed, bounces), shots)
 
 
 @eqx.filter_jit
-def _both_arcs(shots: Range, speed: Array | None) -> tuple[Shot, Shot]:
+def _both_arcs(shots: Range, speed: Array | None, bounces: int) -> tuple[Shot, Shot]:
     if speed is None:
-        shot = _shot(shots, None, None)
+        shot = _shot(shots, None, None, bounces)
         return shot, shot
-    both = lax.map(lambda late: _shot(shots, speed, late), jnp.array([False, True]))
+    both = lax.map(lambda late: _shot(shots, speed, late, bounces), jnp.array([False, True]))
     return tuple(jax.tree.map(lambda leaf, i=i: leaf[i], both) for i in (0, 1))
 
 
-def _shot(shots: Range, speed: Array | None, late: Array | None) -> Shot:
-    """One arc, searched in free flight and flown in the scene as it is."""
-    free = Range(shots.scene.having(contacts=()), shots.target, shots.method, shots.steps)
-    launch = _implicit(free, speed, lambda: _searched(free, speed, late))
+def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -> Shot:
+    """One arc. Without bounces it is searched in free flight; what is in the way shows when it is flown."""
+    if bounces:
+        launch, legal = _implicit(shots, speed, lambda: find_bounced(shots, speed, late, bounces))
+    else:
+        free = Range(shots.scene.having(contacts=()), shots.target, shots.method, shots.steps)
+        launch, legal = _implicit(free, speed, lambda: _searched(free, speed, late))
     flight = shots.flight(launch, save_every=1, record=_height)
     residual = flight.final_scene.state.position - shots.target
-    ok = norm(residual) <= _tolerance(shots, launch)
+    ok = legal & (norm(residual) <= _tolerance(shots, launch))
     velocity, time = (_fixed_unless(ok, part) for part in launch)
     forward = velocity[..., 0] if velocity.shape[-1] == 2 else jnp.hypot(velocity[..., 0], velocity[..., 2])
     return Shot(
@@ -148,13 +156,14 @@ def _shot(shots: Range, speed: Array | None, late: Array | None) -> Shot:
     )
 
 
-def _searched(shots: Range, speed: Array | None, late: Array | None) -> Launch:
-    """The launch that hits or, at a given speed, comes nearest."""
+def _searched(shots: Range, speed: Array | None, late: Array | None) -> tuple[Launch, Array]:
+    """The launch that hits or, at a given speed, comes nearest; of those any will do."""
     launch, found = find(shots, speed, late)
     if speed is None:
-        return launch
+        return launch, found
     too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * _tolerance(shots, launch)
-    return nearest(shots, launch, speed, too_fast | ~found)
+    launch, _ = nearest(shots, launch, speed, too_fast | ~found)
+    return launch, jnp.ones_like(found)
 
 
 def _tolerance(shots: Range, launch: Launch) -> Array:
@@ -163,8 +172,8 @@ def _tolerance(shots: Range, launch: Launch) -> Array:
     return lax.stop_gradient(ROUNDINGS * float(jnp.finfo(extent.dtype).eps) * extent)
 
 
-def _implicit(shots: Range, speed: Array | None, search: Callable) -> Launch:
-    """What the search finds, with the derivatives of the implicit function theorem: it is a root of `conditions`."""
+def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Launch, Array]:
+    """What the search finds, the launch with the derivatives of the implicit function theorem: it is a root of `conditions`."""
 
     def conditions(packed):
         launch = Launch(packed[..., :-1], packed[..., -1])
@@ -177,12 +186,12 @@ def _implicit(shots: Range, speed: Array | None, search: Callable) -> Launch:
         return jnp.concatenate([miss, last[..., None]], axis=-1)
 
     def packed_search(*_):
-        launch = search()
-        return jnp.concatenate([launch.velocity, launch.time[..., None]], axis=-1)
+        launch, legal = search()
+        return jnp.concatenate([launch.velocity, launch.time[..., None]], axis=-1), legal
 
     start = jnp.zeros((*shots.target.shape[:-1], shots.target.shape[-1] + 1), shots.target.dtype)
-    packed = lax.custom_root(conditions, start, packed_search, _solved_by_lane)
-    return Launch(packed[..., :-1], packed[..., -1])
+    packed, legal = lax.custom_root(conditions, start, packed_search, _solved_by_lane, has_aux=True)
+    return Launch(packed[..., :-1], packed[..., -1]), legal
 
 
 def _solved_by_lane(linear: Callable, b: Array) -> Array:
@@ -222,6 +231,20 @@ def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:
 def _fixed_unless(ok: Array, value: Array) -> Array:
     """The value, which does not move with anything where a lane is not ok."""
     return jnp.where(ok if value.ndim == ok.ndim else ok[..., None], value, lax.stop_gradient(value))
+
+
+def _checked_bounces(bounces: int, speed: Any, scene: Scene) -> int:
+    bounces = positive_integer("bounces", bounces, at_least=0)
+    if bounces and speed is None:
+        raise ValueError(
+            "aim_at: got bounces without speed=, expected a speed: the least is found in free flight only."
+        )
+    if bounces and not any(contact.response is impact for contact in scene.contacts):
+        raise ValueError(
+            f"bounces: got {bounces} in a scene without contacts that find the moment of impact, expected some, e.g. "
+            "contacts=(contacts.Plane(point=(0, 0), normal=(0, 1), restitution=0.8),)."
+        )
+    return bounces
 
 
 def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Range:

@@ -203,10 +203,13 @@ class _Descent(NamedTuple):
     going: Bool[Array, "*lanes"]
 
 
-def nearest(shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: Bool[Array, "*lanes"]) -> Launch:
-    """The launch that comes nearest the target, from a start on, at a speed: the method of Levenberg and Marquardt.
+def nearest(
+    shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: Bool[Array, "*lanes"]
+) -> tuple[Launch, Float[Array, "*lanes"]]:
+    """The launch that comes nearest the target, from a start on, at a speed, and its distance [m].
 
-    Unknown are the direction, as turns about it, and the logarithm of the flight time. Only for the `wanted` lanes.
+    The method of Levenberg and Marquardt. Unknown are the direction, as turns about it, and the logarithm of the flight
+    time. Only the `wanted` lanes leave their start, and have a distance that is finite.
     """
     still, zero = jnp.zeros_like(start.time), jnp.zeros_like(start.velocity)
     steps, least = jnp.array(shots.steps, jnp.int32), 0.1 * float(jnp.finfo(still.dtype).eps) ** 0.5
@@ -230,7 +233,8 @@ def nearest(shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: 
     axes = tuple(jnp.broadcast_to(row, zero.shape) for row in jnp.eye(zero.shape[-1], dtype=zero.dtype))
     start = Launch(scale(speed, unit(start.velocity)), start.time)
     begin = _Descent(start, still + jnp.inf, zero, axes, still + 1e-2, wanted)
-    return _repeated(closer, begin, shots, speed, MOST_DOWNHILL).launch
+    end = _repeated(closer, begin, shots, speed, MOST_DOWNHILL)
+    return end.launch, end.distance
 
 
 def _damped(slopes: tuple[Array, ...], miss: Array, damping: Array) -> Array:
