@@ -19,10 +19,10 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, demand, positive_integer, real_quantity
 from physjax.physics.impact import impact
-from physjax.scene import Scene, as_module
+from physjax.scene import Particles, Scene, as_module
 from physjax.stepping.methods import rk4
 from physjax.study.bounced import find_bounced
-from physjax.study.shooting import Launch, Range, find, nearest
+from physjax.study.shooting import Launch, Range, chosen, find, first_guess, nearest
 from physjax.trajectory import Trajectory
 from physjax.vectors import dot, norm
 
@@ -59,7 +59,10 @@ class Shot(NamedTuple):
 
 
 class Aimed(eqx.Module):
-    """The shots at each target: `low`, which is there first, and `high`; at the least speed both are one."""
+    """The shots at each target: `low`, which is there first, and `high`.
+
+    Both are one at the least speed, out of reach, and where there is only one, as in a straight line without forces.
+    """
 
     low: Shot
     high: Shot
@@ -142,7 +145,7 @@ def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -
     flight = shots.flight(launch, save_every=1, record=_height)
     residual = flight.final_scene.state.position - shots.target
     ok = legal & (norm(residual) <= _tolerance(shots, launch))
-    velocity, time = (_fixed_unless(ok, part) for part in launch)
+    velocity, time = launch = _fixed_unless(ok, launch)
     forward = velocity[..., 0] if velocity.shape[-1] == 2 else jnp.hypot(velocity[..., 0], velocity[..., 2])
     return Shot(
         angle=jnp.arctan2(velocity[..., 1], forward),
@@ -161,6 +164,8 @@ def _searched(shots: Range, speed: Array | None, late: Array | None) -> tuple[La
     launch, found = find(shots, speed, late)
     if speed is None:
         return launch, found
+    # without a force to bring it back there is no high arc, and the search for it runs away
+    launch = chosen(norm(launch.velocity) > 0.5 * speed, launch, first_guess(shots, speed))
     too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * _tolerance(shots, launch)
     launch, _ = nearest(shots, launch, speed, too_fast | ~found)
     return launch, jnp.ones_like(found)
@@ -228,9 +233,9 @@ def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:
     return jnp.maximum(jnp.max(top, axis=0), height[-1])
 
 
-def _fixed_unless(ok: Array, value: Array) -> Array:
-    """The value, which does not move with anything where a lane is not ok."""
-    return jnp.where(ok if value.ndim == ok.ndim else ok[..., None], value, lax.stop_gradient(value))
+def _fixed_unless(ok: Array, values: Any) -> Any:
+    """The values, which do not move with anything where a lane is not ok."""
+    return chosen(ok, values, lax.stop_gradient(values))
 
 
 def _checked_bounces(bounces: int, speed: Any, scene: Scene) -> int:
@@ -281,5 +286,5 @@ def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Ran
     away = norm(target - position)
     if concrete(away) is not None:
         demand("distance from launch to target [m]", away, concrete(away) > 0, "a target away from the launch")
-    state = type(scene.state)(position, jnp.broadcast_to(scene.state.velocity, shape))
-    return Range(scene.having(state=state), target, as_module(method), steps)
+    at_rest = Particles(position, jnp.zeros_like(position))
+    return Range(scene.having(state=at_rest), target, as_module(method), steps)

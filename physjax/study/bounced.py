@@ -27,7 +27,7 @@ CANDIDATES = 4
 def find_bounced(
     shots: Range, speed: Float[Array, "*lanes"], late: Bool[Array, ""], bounces: int
 ) -> tuple[Launch, Bool[Array, "*lanes"]]:
-    """The launch at a speed [m/s] that hits after so many bounces, the soonest or the `late`-st, and whether it has bounced so.
+    """The launch at a speed [m/s] that hits after so many bounces, the soonest or the latest, and whether it bounces so.
 
     Where none hits, the one that comes nearest. What lies between the directions of the fan may be overlooked.
     """
@@ -128,8 +128,7 @@ def _clock(shots: Range, speed: Array, bounces: int) -> tuple[Array, Array]:
 
     The last is as late as flights at this speed can be without drag, from bounce to bounce.
     """
-    distance, position = norm(shots.offset), shots.scene.state.position
-    pull = norm(shots.scene.acceleration(0.0, type(shots.scene.state)(position, jnp.zeros_like(position))))
+    distance, pull = norm(shots.offset), norm(shots.pull)
     first = distance / (8 * speed)
     idle = 16 * (bounces + 1) * distance / speed
     arcs = (bounces + 1) * (2 * speed / jnp.where(pull > 0, pull, 1.0)) + 2 * distance / speed

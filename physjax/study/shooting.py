@@ -51,6 +51,12 @@ class Range(eqx.Module):
         """From the launch to the target [m]."""
         return self.target - self.scene.state.position
 
+    @property
+    def pull(self) -> Float[Array, "*lanes dim"]:
+        """The acceleration of a lane at rest at the launch [m/s²]."""
+        position = self.scene.state.position
+        return self.scene.acceleration(0.0, Particles(position, jnp.zeros_like(position)))
+
     def fired(self, velocity: Float[Array, "*lanes dim"]) -> Scene:
         """The scene with these launch velocities [m/s]."""
         scene = self.scene
@@ -99,8 +105,7 @@ class _Search(NamedTuple):
 
 def first_guess(shots: Range, speed: Float[Array, "*lanes"] | None) -> Launch:
     """The launch in the valley as if the acceleration at rest stayed: T = √(2|Δ|/a), v = Δ/T - ½aT, not above the speed."""
-    position = shots.scene.state.position
-    pull = shots.scene.acceleration(0.0, Particles(position, jnp.zeros_like(position)))
+    pull = shots.pull
     distance, strength = norm(shots.offset), norm(pull)
     pulled = strength > 0
     idle = distance if speed is None else distance / speed
@@ -128,7 +133,7 @@ def find(
     def phase(search, precision):
         sound = jnp.isfinite(search.launch.time) & jnp.isfinite(norm(search.launch.velocity))
         search = search._replace(
-            launch=Launch(*(_chosen(sound, *both) for both in zip(search.launch, guess, strict=True))),
+            launch=chosen(sound, search.launch, guess),
             going=jnp.ones_like(search.going),
         )
         return _repeated(partial(_closer, late, precision), search, shots, speed, MOST), None
@@ -155,7 +160,7 @@ def _repeated(closer: Callable, begin: Any, shots: Range, speed: Array | None, m
 
     def once(search, shots, speed):
         after = closer(search, shots, speed)
-        return jax.tree.map(lambda new, old: _chosen(search.going, new, old), after, search)
+        return chosen(search.going, after, search)
 
     def body(search):
         return on_flagged(once, search.going, search, shots, speed, cut=cut)
@@ -226,7 +231,7 @@ def nearest(
         small = (norm(stacked(step)) <= least) & jnp.isfinite(now.distance)
         after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.going)
         worse = now._replace(damping=3.0 * now.damping)
-        after = jax.tree.map(lambda new, old: _chosen(better, new, old), after, worse)
+        after = chosen(better, after, worse)
         return after._replace(going=~small & (after.damping < 1e8))
 
     # the first step is none at all, and finds the slopes
@@ -276,6 +281,7 @@ def solved(columns: list[Float[Array, "*lanes dim"]], b: Float[Array, "*lanes di
     return stacked([part / volume for part in volumes])
 
 
-def _chosen(flag: Array, new: Array, old: Array) -> Array:
-    """Lane by lane the new where flagged, for numbers and vectors."""
-    return jnp.where(flag if new.ndim == flag.ndim else flag[..., None], new, old)
+def chosen(flag: Bool[Array, "*lanes"], new: Any, old: Any) -> Any:
+    """Lane by lane the new where flagged, else the old, for trees of numbers and vectors."""
+    one = lambda a, b: jnp.where(flag if a.ndim == flag.ndim else flag[..., None], a, b)  # noqa: E731
+    return jax.tree.map(one, new, old)

@@ -119,6 +119,8 @@ def test_overhead_below_and_without_gravity():
     assert straight.low.ok
     assert straight.low.angle == pytest.approx(math.atan2(4, 3), abs=1e-12)
     assert straight.low.time == pytest.approx(0.5, abs=1e-12)
+    assert straight.high.ok
+    assert straight.high.time == pytest.approx(0.5, abs=1e-12)
 
 
 # with drag and wind: no closed form
