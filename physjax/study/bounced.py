@@ -16,11 +16,11 @@ from physjax.scene import Scene
 from physjax.study.shooting import Launch, Range, nearest
 from physjax.vectors import dot, norm, scale
 
-AROUND, UP = 64, 24
-"""Directions of the fan: so many around the circle in the plane; half of them around and so many upward in space."""
+CIRCLE, RINGS = 256, (24, 32)
+"""Directions of the fan: around the circle in the plane; in space on so many rings, so many on each."""
 FRAMES = 96
 """Steps of a flight in the fan, growing with time."""
-CANDIDATES = 4
+CANDIDATES = 8
 """Best directions of the fan that are refined."""
 
 
@@ -35,11 +35,11 @@ def find_bounced(
     wanted = jnp.ones(speed.shape, bool)
     launches, distance = lax.map(lambda start: nearest(shots, start, speed, wanted), starts)
     right = lax.map(lambda launch: _touches(shots, launch), launches) == bounces
-    extent = speed * launches.time
+    extent = speed[None] * launches.time
     hit = right & (distance <= float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent)
     order = jnp.where(late, -launches.time, launches.time)
     # hits come first, by time; then the nearest with the right number of bounces; then the others
-    worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0), axis=0) + 1
+    worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0)) + 1
     rank = jnp.where(hit, order, worst + jnp.where(right, distance, 1e6 + distance))
     chosen = jnp.argmin(jnp.where(jnp.isfinite(rank), rank, jnp.inf), axis=0)
     return jax.tree.map(lambda leaf: _picked(leaf, chosen), (launches, right))
@@ -53,7 +53,7 @@ def _touches(shots: Range, launch: Launch) -> Int[Array, "*lanes"]:
         scene, count = carry
         scene, touched, moved = _watched_step(scene, shots.method, i.astype(dt.dtype) * dt, dt)
         last = i == shots.steps - 1
-        return (scene, count + jnp.where(last, moved, touched)), None
+        return (scene, count + jnp.where(last, moved, touched).astype(count.dtype)), None
 
     begin = (shots.fired(launch.velocity), jnp.zeros(launch.time.shape, jnp.int32))
     return lax.scan(step, begin, number)[0][1]
@@ -91,11 +91,10 @@ def _best_of_fan(shots: Range, speed: Array, bounces: int) -> Launch:
 
 def _directions(dim: int, dtype: Any) -> Float[Array, "up around dim"]:
     """Unit vectors, evenly around a circle, or on rings from nearly straight down to nearly straight up."""
+    around = lambda count: 2 * math.pi / count * (jnp.arange(count, dtype=dtype) + 0.5)  # noqa: E731
     if dim == 2:
-        turn = 2 * math.pi / AROUND * (jnp.arange(AROUND, dtype=dtype) + 0.5)
-        return jnp.stack([jnp.cos(turn), jnp.sin(turn)], axis=-1)[None]
-    rise = math.pi * ((jnp.arange(UP, dtype=dtype) + 0.5) / UP - 0.5)
-    turn = 4 * math.pi / AROUND * (jnp.arange(AROUND // 2, dtype=dtype) + 0.5)
+        return jnp.stack([jnp.cos(around(CIRCLE)), jnp.sin(around(CIRCLE))], axis=-1)[None]
+    rise, turn = 0.5 * (around(RINGS[0]) - math.pi), around(RINGS[1])
     rise, turn = jnp.meshgrid(rise, turn, indexing="ij")
     return jnp.stack([jnp.cos(rise) * jnp.cos(turn), jnp.sin(rise), jnp.cos(rise) * jnp.sin(turn)], axis=-1)
 
@@ -115,7 +114,7 @@ def _closest(shots: Range, velocity: Array, speed: Array, bounces: int) -> tuple
         away = norm(x + scale(share, chord) - shots.target)
         better = (count == bounces) & ~touched & (away < best)
         best, when = jnp.where(better, away, best), jnp.where(better, t + share * dt, when)
-        return (scene, count + touched, after, best, when), None
+        return (scene, count + touched.astype(count.dtype), after, best, when), None
 
     still = jnp.zeros_like(speed)
     begin = (shots.fired(velocity), jnp.zeros(still.shape, jnp.int32), still, still + jnp.inf, first)

@@ -7,7 +7,7 @@ from physjax import Particles, Scene, aim_at, contacts, forces
 
 
 def test_both_arcs_end_on_the_target_and_a_miss_says_so():
-    wall = contacts.Plane(point=(0.0, -2.0), normal=(0.0, 1.0))
+    wall = contacts.Plane(point=(0.0, -2.0), normal=(0.0, 1.0), response=contacts.project)
     ball = Scene(Particles(jnp.zeros(2), jnp.zeros(2)), forces=(forces.Gravity(),), contacts=(wall,))
     ax = aim_at(ball, (40.0, 3.0), speed=25.0).plot()
     low, high = ax.lines[:2]

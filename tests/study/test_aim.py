@@ -266,7 +266,7 @@ def test_vmap_is_the_same_as_lanes(precision):
 
 
 def test_a_wall_in_the_way_stops_the_low_arc_and_not_the_high_one():
-    wall = contacts.Sphere(center=(20.0, 0.0), radius=7.0)
+    wall = contacts.Sphere(center=(20.0, 0.0), radius=7.0, response=contacts.project)
     aimed = aim_at(ball(contacts=(wall,)), (40.0, 0.0), speed=22.0)
     assert not aimed.low.ok
     assert aimed.high.ok
