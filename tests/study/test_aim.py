@@ -195,13 +195,13 @@ def test_magnus_buoyancy_and_crosswind_in_space():
         np.testing.assert_allclose(end, [20.0, 2.0, 4.0], atol=1e-6)
 
 
-def test_any_method_aims_by_its_own_path():
-    for method in (methods.verlet, methods.semi_implicit_euler):
-        aimed = aim_at(ball(2, forces.QuadraticDrag(**BASEBALL)), (40.0, 3.0), speed=30.0, method=method, steps=50)
-        flight = aimed.flight(aimed.low)
-        assert aimed.low.ok
-        np.testing.assert_allclose(flight.position[-1], [40.0, 3.0], atol=1e-10)
-        assert flight.position.shape == (51, 2)
+def test_another_method_aims_by_its_own_path():
+    scene = ball(2, forces.QuadraticDrag(**BASEBALL))
+    aimed = aim_at(scene, (40.0, 3.0), speed=30.0, method=methods.semi_implicit_euler, steps=50)
+    flight = aimed.flight(aimed.low)
+    assert aimed.low.ok
+    np.testing.assert_allclose(flight.position[-1], [40.0, 3.0], atol=1e-10)
+    assert flight.position.shape == (51, 2)
 
 
 # derivatives
