@@ -192,11 +192,12 @@ def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Laun
 
     def packed_search(*_):
         launch, legal = search()
-        return jnp.concatenate([launch.velocity, launch.time[..., None]], axis=-1), legal
+        # as a number: before jax 0.11 what comes along with a root cannot be a boolean in derivatives
+        return jnp.concatenate([launch.velocity, launch.time[..., None]], axis=-1), legal.astype(start.dtype)
 
     start = jnp.zeros((*shots.target.shape[:-1], shots.target.shape[-1] + 1), shots.target.dtype)
     packed, legal = lax.custom_root(conditions, start, packed_search, _solved_by_lane, has_aux=True)
-    return Launch(packed[..., :-1], packed[..., -1]), legal
+    return Launch(packed[..., :-1], packed[..., -1]), legal > 0
 
 
 def _solved_by_lane(linear: Callable, b: Array) -> Array:
