@@ -40,7 +40,7 @@ class Shot(NamedTuple):
     `angle` is the elevation above the horizontal [rad], beyond a right angle for a shot back along x in the plane; in
     space `azimuth` [rad] is its bearing from x towards z. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
     `apex`, the greatest height on the way [m]; `residual`, from the target to where the flight ends [m]. Where `ok` is
-    False this is the nearest miss, and its derivatives are zero.
+    False this is the nearest miss, or what something in the way makes of the shot, and its derivatives are zero.
     """
 
     angle: Float[Array, "*lanes"]
@@ -146,7 +146,7 @@ def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -
     residual = flight.final_scene.state.position - shots.target
     ok = legal & (norm(residual) <= _tolerance(shots, launch))
     velocity, time = launch = _fixed_unless(ok, launch)
-    forward = velocity[..., 0] if velocity.shape[-1] == 2 else jnp.hypot(velocity[..., 0], velocity[..., 2])
+    forward = velocity[..., 0] if velocity.shape[-1] == 2 else norm(velocity[..., ::2])
     return Shot(
         angle=jnp.arctan2(velocity[..., 1], forward),
         azimuth=None if velocity.shape[-1] == 2 else jnp.arctan2(velocity[..., 2], velocity[..., 0]),
