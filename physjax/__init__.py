@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from physjax.physics import contacts, lattices, springs
     from physjax.show import animate, plot
     from physjax.study import accuracy, energy, gradients, projectile, stability
+    from physjax.study.aim import aim_at
     from physjax.study.fit import fit
+    from physjax.study.solve import minimise, solve
 
 __all__ = [
     "Contact",
@@ -27,6 +29,7 @@ __all__ = [
     "Scene",
     "Trajectory",
     "accuracy",
+    "aim_at",
     "animate",
     "contacts",
     "energy",
@@ -36,12 +39,14 @@ __all__ = [
     "lattices",
     "loads",
     "methods",
+    "minimise",
     "ode_term",
     "plot",
     "projectile",
     "reference",
     "scenes",
     "simulate",
+    "solve",
     "springs",
     "stability",
 ]
@@ -50,15 +55,18 @@ __version__ = "0.1.0"
 # loaded when first named: what not every run needs should not make `import physjax` slower
 _LATER = {
     "accuracy": "physjax.study.accuracy",
+    "aim_at": "physjax.study.aim:aim_at",
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
     "fit": "physjax.study.fit:fit",
     "gradients": "physjax.study.gradients",
     "lattices": "physjax.physics.lattices",
+    "minimise": "physjax.study.solve:minimise",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
     "scenes": "physjax.scenes",
+    "solve": "physjax.study.solve:solve",
     "springs": "physjax.physics.springs",
     "stability": "physjax.study.stability",
 }

@@ -35,6 +35,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stability.add_argument("--steps", type=int, default=4000, help="steps of a measuring run (default: 4000)")
     stability.set_defaults(run=lambda options: _stability(options.scene, options.out, options.steps))
 
+    aim = commands.add_parser("aim", help="which angle hits a target: both arcs, with drag and wind")
+    aim.add_argument("--target", type=float, nargs="+", required=True, metavar="M", help="x y, or x y z [m]; y is up")
+    aim.add_argument("--speed", type=float, help="launch speed [m/s]; the least that hits if left out")
+    aim.add_argument(
+        "--start", type=float, nargs="+", metavar="M", help="where it is fired from [m] (default: the origin)"
+    )
+    aim.add_argument(
+        "--drag", type=float, metavar="CDA", help="drag coefficient times area [m²], in air of 1.225 kg/m³"
+    )
+    aim.add_argument("--mass", type=float, default=1.0, help="mass [kg] (default: 1)")
+    aim.add_argument(
+        "--wind", type=float, nargs="+", metavar="V", help="velocity of the air [m/s]; acts through --drag"
+    )
+    aim.add_argument("--gravity", type=float, default=9.8, help="g [m/s²] (default: 9.8)")
+    aim.add_argument("--out", default="aim", metavar="DIR", help="where the picture goes (default: aim)")
+    aim.set_defaults(run=_aim)
+
     options = parser.parse_args(arguments)
     try:
         options.run(options)
@@ -151,6 +168,60 @@ def _limit_texts(predicted: float, measured: float | None) -> list[str]:
     if not predicted or predicted == float("inf"):
         return ["none" if predicted else "never stable", "-"]
     return [seconds_text(predicted), "-" if measured is None else seconds_text(measured)]
+
+
+def _aim(options: argparse.Namespace) -> None:
+    """Print both arcs to a target with their angle, flight time and apex; write their picture as PNG."""
+    import jax
+    import matplotlib
+    import numpy as np
+
+    from physjax.files import replacing, writable_folder
+    from physjax.show.report import table
+    from physjax.study.aim import aim_at
+
+    with jax.enable_x64(True):
+        scene = _thrown(options)
+        folder = writable_folder(options.out)
+        aimed = aim_at(scene, options.target, speed=options.speed)
+        arcs = {"low": aimed.low, "high": aimed.high} if options.speed is not None else {"least speed": aimed.low}
+        angles = ["angle [°]"] if aimed.low.azimuth is None else ["angle [°]", "azimuth [°]"]
+        rows = [
+            [
+                name,
+                "hit" if shot.ok else "out of reach",
+                *(f"{np.degrees(angle):.4f}" for angle in (shot.angle, shot.azimuth) if angle is not None),
+                *(f"{float(number):.4f}" for number in (shot.speed, shot.time, shot.apex)),
+                f"{float(shot.miss):.2g}",
+            ]
+            for name, shot in arcs.items()
+        ]
+        headers = ["arc", "", *angles, "speed [m/s]", "time [s]", "apex [m]", "miss [m]"]
+        print(table(headers, rows, align="<<" + ">" * (len(headers) - 2)))
+        if not aimed.ok:
+            print("The target is out of reach: these are the nearest misses.")
+        matplotlib.use("Agg")
+        with replacing(folder / "aim.png", "wb") as file:
+            aimed.plot().figure.savefig(file, dpi=125)
+    print(f"Picture: {folder / 'aim.png'}")
+
+
+def _thrown(options: argparse.Namespace):
+    """The scene of `physjax aim`."""
+    from physjax.physics import forces
+    from physjax.scene import Particles, Scene
+
+    dim = len(options.target)
+    start = options.start or [0.0] * dim
+    for name, given in (("start", start), ("wind", options.wind)):
+        if given is not None and len(given) != dim:
+            raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
+    if options.wind is not None and options.drag is None:
+        raise ValueError("--wind: got a wind without --drag, expected both: the air acts through the drag.")
+    loads = [forces.Gravity(options.gravity)]
+    if options.drag is not None:
+        loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
+    return Scene(Particles(start, [0.0] * dim), mass=options.mass, forces=tuple(loads))
 
 
 def _study(name: str, folder: Path, quick: bool):

@@ -54,6 +54,32 @@ def test_scenes_lists_the_gallery(capsys):
         assert name in printed
 
 
+def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
+    aim = ["aim", "--speed", "30", "--target", "40", "0", "--drag", "0.0", "--out", str(tmp_path)]
+    assert main([*aim, "--wind", "-5", "0"]) == 0
+    printed = capsys.readouterr().out
+    assert "12.9103" in printed  # ½ asin(40 g/30²) = 12.910325°
+    assert "77.0897" in printed
+    assert "out of reach" not in printed
+    assert (tmp_path / "aim.png").stat().st_size > 10_000
+    assert main([*aim, "--wind", "-5", "0", "--target", "400", "0"]) == 0
+    assert "nearest misses" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--speed", "0"], "numbers > 0"),
+        (["--speed", "30", "--wind", "1", "0"], "without --drag"),
+        (["--speed", "30", "--start", "1"], "expected 2"),
+        (["--speed", "30", "--start", "40", "0"], "away from the launch"),
+    ],
+)
+def test_aim_refuses_what_cannot_be(options, words, tmp_path, capsys):
+    assert main(["aim", "--target", "40", "0", "--out", str(tmp_path), *options]) == 2
+    assert words in capsys.readouterr().err
+
+
 def test_python_m_physjax_is_the_same_command():
     run = subprocess.run([sys.executable, "-m", "physjax", "--help"], capture_output=True, text=True, check=True)
     assert "chart" in run.stdout
