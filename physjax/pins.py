@@ -57,8 +57,13 @@ class Pins(eqx.Module):
         _, bend = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
         return self._on_led(bend, acceleration)
 
-    def prepared(self, state: Particles) -> "Pins":
+    def prepared(self, state: Any) -> "Pins":
         """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
+        if not isinstance(state, Particles):
+            raise TypeError(
+                f"Pins: got a state of type {type(state).__name__}, expected Particles: bodies cannot be led yet. Hold "
+                "one with a mask, pinned=mask, or by a point of itself, mass=inertia.about(pivot)."
+            )
         if self.nodes.shape != state.lanes:
             raise ValueError(
                 f"Pins: got nodes of shape {self.nodes.shape}, expected booleans of the lanes' shape {state.lanes}."

@@ -117,3 +117,35 @@ def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"
     if amount.ndim == 0:
         return jnp.broadcast_to(amount * axis, like.shape)
     return scale(amount, jnp.broadcast_to(axis, like.shape))
+
+
+def conjugate(q: Float[Array, "*lanes 4"]) -> Float[Array, "*lanes 4"]:
+    """The turn back: (w, -x, -y, -z)."""
+    w, x, y, z = components(q)
+    return stacked([w, -x, -y, -z])
+
+
+def compose(a: Float[Array, "*lanes 4"], b: Float[Array, "*lanes 4"]) -> Float[Array, "*lanes 4"]:
+    """Hamilton's product ab of quaternions (w, x, y, z): the turn b, then the turn a."""
+    w, x, y, z = components(a)
+    s, u, v, n = components(b)
+    return stacked(
+        [
+            w * s - x * u - y * v - z * n,
+            w * u + x * s + y * n - z * v,
+            w * v - x * n + y * s + z * u,
+            w * n + x * v - y * u + z * s,
+        ]
+    )
+
+
+def turn(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    """The vector v turned by the unit quaternion q: from the body's frame to the world's, for an orientation q."""
+    axis = q[..., 1:]
+    twice = 2.0 * cross(axis, v)
+    return v + scale(q[..., 0], twice) + cross(axis, twice)
+
+
+def turn_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    """The vector v turned back by the unit quaternion q: from the world's frame to the body's."""
+    return turn(conjugate(q), v)

@@ -23,6 +23,7 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FIL
 
 FLOORS = (
     {"vectors", "checks", "files", "lanes"},
+    {"particles"},
     {"scene"},
     {"trajectory", "pins"},
     {"physics", "stepping"},
