@@ -13,7 +13,9 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from physjax import scenes
-    from physjax.physics import contacts, lattices, springs
+    from physjax.physics import contacts, inertia, lattices, rigid, springs
+    from physjax.physics.inertia import Inertia
+    from physjax.physics.rigid import RigidBodies
     from physjax.show import animate, plot
     from physjax.study import accuracy, energy, projectile, stability
 
@@ -21,8 +23,10 @@ __all__ = [
     "Contact",
     "Field",
     "Force",
+    "Inertia",
     "Particles",
     "Pins",
+    "RigidBodies",
     "Scene",
     "Trajectory",
     "accuracy",
@@ -30,6 +34,7 @@ __all__ = [
     "contacts",
     "energy",
     "forces",
+    "inertia",
     "lattices",
     "loads",
     "methods",
@@ -37,6 +42,7 @@ __all__ = [
     "plot",
     "projectile",
     "reference",
+    "rigid",
     "scenes",
     "simulate",
     "springs",
@@ -50,18 +56,25 @@ _LATER = {
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
+    "inertia": "physjax.physics.inertia",
     "lattices": "physjax.physics.lattices",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
+    "rigid": "physjax.physics.rigid",
     "scenes": "physjax.scenes",
     "springs": "physjax.physics.springs",
     "stability": "physjax.study.stability",
 }
 
 
+_PARTS = {"Inertia": "inertia", "RigidBodies": "rigid"}
+
+
 def __getattr__(name: str) -> object:
     if name in _LATER:
         return import_module(_LATER[name])
+    if name in _PARTS:
+        return getattr(import_module(_LATER[_PARTS[name]]), name)
     raise AttributeError(f"module 'physjax' has no attribute {name!r}")
 
 

@@ -119,33 +119,40 @@ def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"
     return scale(amount, jnp.broadcast_to(axis, like.shape))
 
 
-def conjugate(q: Float[Array, "*lanes 4"]) -> Float[Array, "*lanes 4"]:
-    """The turn back: (w, -x, -y, -z)."""
-    w, x, y, z = components(q)
-    return stacked([w, -x, -y, -z])
+# quaternions (w, x, y, z); by lists of components, since XLA on CPU computes a vector anew for each reader of a component
 
 
-def compose(a: Float[Array, "*lanes 4"], b: Float[Array, "*lanes 4"]) -> Float[Array, "*lanes 4"]:
-    """Hamilton's product ab of quaternions (w, x, y, z): the turn b, then the turn a."""
-    w, x, y, z = components(a)
-    s, u, v, n = components(b)
-    return stacked(
-        [
-            w * s - x * u - y * v - z * n,
-            w * u + x * s + y * n - z * v,
-            w * v - x * n + y * s + z * u,
-            w * n + x * v - y * u + z * s,
-        ]
-    )
+def composed(a: list[ArrayLike], b: list[ArrayLike]) -> list[Array]:
+    """Hamilton's product ab of quaternions in components: the turn b, then the turn a."""
+    w, x, y, z = a
+    s, u, v, n = b
+    return [
+        w * s - x * u - y * v - z * n,
+        w * u + x * s + y * n - z * v,
+        w * v - x * n + y * s + z * u,
+        w * n + x * v - y * u + z * s,
+    ]
+
+
+def reverse(q: list[Array]) -> list[Array]:
+    """The turn back, in components: (w, -x, -y, -z)."""
+    w, x, y, z = q
+    return [w, -x, -y, -z]
+
+
+def turned(q: list[Array], v: list[Array]) -> list[Array]:
+    """The vector v turned by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
+    w, x, y, z = q
+    a, b, c = v
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return [a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p]
 
 
 def turn(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """The vector v turned by the unit quaternion q: from the body's frame to the world's, for an orientation q."""
-    axis = q[..., 1:]
-    twice = 2.0 * cross(axis, v)
-    return v + scale(q[..., 0], twice) + cross(axis, twice)
+    return stacked(turned(components(q), components(v)))
 
 
 def turn_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """The vector v turned back by the unit quaternion q: from the world's frame to the body's."""
-    return turn(conjugate(q), v)
+    return stacked(turned(reverse(components(q)), components(v)))

@@ -16,20 +16,21 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import real_array, real_quantity
+from physjax.lanes import kept_apart
 from physjax.particles import Particles, added, shaped
 from physjax.physics.inertia import Inertia, real_turn
 from physjax.scene import Force, loads
 from physjax.vectors import (
     components,
-    compose,
-    conjugate,
+    composed,
     cross,
     dot,
     over,
+    reverse,
     scale,
     stacked,
     turn,
-    turn_back,
+    turned,
 )
 
 
@@ -128,10 +129,10 @@ class RigidBodies(NamedTuple):
     def rate(self, wrench: Wrench, inertia: Inertia) -> "RigidBodies":
         """Time derivative: x' = p/m, q' = ½(0, ω)q, p' = F, L' = τ; on a pivot what follows from turning about it."""
         force, torque = wrench
-        omega = angular_velocity(self, inertia)
-        turning = compose(_pure(0.5 * omega), self.orientation)
+        turning = _turning(self, inertia)
         if inertia.arm is None:
             return RigidBodies(scale(1 / inertia.mass, self.momentum), turning, force, torque)
+        omega = angular_velocity(self, inertia)
         arm = turn(self.orientation, over(inertia.arm, self.position))
         torque = torque + cross(arm, force)
         velocity = cross(omega, arm)
@@ -230,14 +231,8 @@ def angular_acceleration(
     bodies: RigidBodies, inertia: Inertia, torque: Float[Array, "*lanes 3"]
 ) -> Float[Array, "*lanes 3"]:
     """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world's frame; the torque [N m] about the centre of mass, or the pivot."""
-    omega = angular_velocity(bodies, inertia)
-    return _answer(bodies, inertia, torque - cross(omega, bodies.angular_momentum))
-
-
-def principal_frame(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 4"]:
-    """The quaternion from the principal axes to the world."""
-    q = bodies.orientation
-    return q if inertia.axes is None else compose(q, over(inertia.axes, q))
+    gyroscopic = cross(angular_velocity(bodies, inertia), bodies.angular_momentum)
+    return _answer(bodies, inertia, torque - gyroscopic)
 
 
 def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
@@ -247,27 +242,50 @@ def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Arr
     closed form, one after the other and back: half, half, whole, half, half. Exactly reversible in time, and no energy
     is gained or lost in the long run (R. McLachlan 1993, S. Reich 1994).
     """
-    frame = principal_frame(bodies, inertia)
-    spin = components(turn_back(frame, bodies.angular_momentum))
+    w, *v = _principal_frame(bodies, inertia)
+    spin = turned(reverse([w, *v]), components(bodies.angular_momentum))
     inverse = components(over(inertia.inverse, bodies.angular_momentum))
-    w, *v = components(frame)
     for i, share in ((0, 0.25), (1, 0.25), (2, 0.5), (1, 0.25), (0, 0.25)):
         j, k = (i + 1) % 3, (i + 2) % 3
-        half = scale(dt, share * inverse[i] * spin[i])
-        c, s = jnp.cos(half), jnp.sin(half)
+        c, s = _cosine_and_sine(scale(dt, share * inverse[i] * spin[i]), dt)
         w, v[i], v[j], v[k] = w * c - v[i] * s, v[i] * c + w * s, v[j] * c + v[k] * s, v[k] * c - v[j] * s
         cosine, sine = c * c - s * s, 2.0 * c * s
         spin[j], spin[k] = cosine * spin[j] + sine * spin[k], cosine * spin[k] - sine * spin[j]
-    frame = stacked([w, *v])
-    return frame if inertia.axes is None else compose(frame, conjugate(over(inertia.axes, frame)))
+    return _body_frame([w, *v], bodies, inertia)
+
+
+def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
+    # kept apart: XLA on CPU would compute them again for each of the many that are made of them
+    return kept_apart(dt, lambda: (jnp.cos(angle), jnp.sin(angle)))
+
+
+def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
+    """The quaternion from the principal axes to the world, in components."""
+    q = components(bodies.orientation)
+    return q if inertia.axes is None else composed(q, components(over(inertia.axes, bodies.orientation)))
+
+
+def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
+    """The quaternion whose turn of the principal axes is `frame`."""
+    if inertia.axes is not None:
+        frame = composed(frame, reverse(components(over(inertia.axes, bodies.orientation))))
+    return stacked(frame)
+
+
+def _turning(bodies: RigidBodies, inertia: Inertia) -> Array:
+    """q' = ½ q (0, ω), with ω seen from the body, which is cheaper than ½ (0, ω) q with ω seen from the world."""
+    frame = _principal_frame(bodies, inertia)
+    x, y, z = _seen(frame, inertia, bodies.angular_momentum)
+    return _body_frame(composed(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
+
+
+def _seen(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
+    """I⁻¹ times a vector of the world, along the principal axes."""
+    parts = zip(components(over(inertia.inverse, vector)), turned(reverse(frame), components(vector)), strict=True)
+    return [number * part for number, part in parts]
 
 
 def _answer(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
     """R I⁻¹ Rᵀ times a vector of the world."""
-    frame = principal_frame(bodies, inertia)
-    return turn(frame, over(inertia.inverse, vector) * turn_back(frame, vector))
-
-
-def _pure(v: Array) -> Array:
-    """The quaternion (0, v)."""
-    return stacked([jnp.zeros_like(v[..., 0]), *components(v)])
+    frame = _principal_frame(bodies, inertia)
+    return stacked(turned(frame, _seen(frame, inertia, vector)))
