@@ -122,7 +122,7 @@ def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"
 # quaternions (w, x, y, z); by lists of components, since XLA on CPU computes a vector anew for each reader of a component
 
 
-def composed(a: list[ArrayLike], b: list[ArrayLike]) -> list[Array]:
+def composed(a: list, b: list) -> list:
     """Hamilton's product ab of quaternions in components: the turn b, then the turn a."""
     w, x, y, z = a
     s, u, v, n = b
@@ -134,13 +134,13 @@ def composed(a: list[ArrayLike], b: list[ArrayLike]) -> list[Array]:
     ]
 
 
-def reverse(q: list[Array]) -> list[Array]:
+def reverse(q: list) -> list:
     """The turn back, in components: (w, -x, -y, -z)."""
     w, x, y, z = q
     return [w, -x, -y, -z]
 
 
-def turned(q: list[Array], v: list[Array]) -> list[Array]:
+def turned(q: list, v: list) -> list:
     """The vector v turned by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
     w, x, y, z = q
     a, b, c = v
