@@ -54,7 +54,8 @@ def bodies(
     """Bodies that begin with these velocities: p = m v, L = R I Rᵀ ω.
 
     Vectors are `(3,)` for all or one per lane, `(*lanes, 3)`, the orientation a quaternion of any length. The angular
-    velocity [rad/s] is in the `frame` of the "world" or the "body". On a pivot the velocity follows from it.
+    velocity [rad/s] is in the `frame` of the "world" or the "body". On a pivot the velocity follows from it. The float
+    type is the position's.
     """
     _demand_frame(frame)
     named = {"position [m]": position, "velocity [m/s]": velocity, "angular velocity [rad/s]": angular_velocity}
@@ -63,15 +64,14 @@ def bodies(
     if any(a.shape[-1:] != (3,) for a in (x, v, omega)):
         raise ValueError(f"bodies: got vectors of shapes {x.shape}, {v.shape}, {omega.shape}, expected (*lanes, 3).")
     parts = (x[..., 0], v[..., 0], omega[..., 0], q[..., 0], inertia.mass, inertia.principal[..., 0])
-    lanes = jnp.broadcast_shapes(*(part.shape for part in parts))
-    x, v, omega, q = (jnp.broadcast_to(a, (*lanes, a.shape[-1])) for a in (x, v, omega, q))
+    lanes, dtype = jnp.broadcast_shapes(*(part.shape for part in parts)), x.dtype
+    x, v, omega, q = (jnp.broadcast_to(a, (*lanes, a.shape[-1])).astype(dtype) for a in (x, v, omega, q))
+    inertia = inertia.checked(lanes, dtype)
     omega = omega if frame == "body" else turn_back(q, omega)
-    if inertia.axes is None:
-        spin = over(inertia.principal, omega) * omega
-    else:
-        axes = over(inertia.axes, q)
-        spin = turn(axes, over(inertia.principal, omega) * turn_back(axes, omega))
-    return RigidBodies(x, q, scale(inertia.mass, v), turn(q, spin))
+    axes = None if inertia.axes is None else over(inertia.axes, q)
+    along = omega if axes is None else turn_back(axes, omega)
+    spin = over(inertia.principal, omega) * along
+    return RigidBodies(x, q, scale(inertia.mass, v), turn(q, spin if axes is None else turn(axes, spin)))
 
 
 def on_bodies(function: Callable, *, couples: bool = False) -> Load:
