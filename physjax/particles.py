@@ -37,6 +37,11 @@ class Particles(NamedTuple):
         """Floating-point type, which every number of the scene follows."""
         return self.position.dtype
 
+    @property
+    def place(self) -> Float[Array | np.ndarray, "*lanes dim"]:
+        """What the errors of a path are measured by: the position [m]."""
+        return self.position
+
     def shown_to(self, force: Any, mass: Float[Array, "..."]) -> tuple["Particles", Float[Array, "..."]]:
         """The state and the mass that a force sees."""
         return self, mass
@@ -99,6 +104,12 @@ class Particles(NamedTuple):
         if mass.shape not in ((), state.lanes):
             raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {state.lanes}.")
         return state, mass
+
+
+def demand_particles(what: str, state: Any, why: str) -> None:
+    """Raise a TypeError for a state of another kind, where something is done with particles only."""
+    if not isinstance(state, Particles):
+        raise TypeError(f"{what}: got a state of type {type(state).__name__}, expected Particles: {why}.")
 
 
 def added(terms: Any) -> Array:

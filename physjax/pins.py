@@ -12,7 +12,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete
-from physjax.scene import Particles, as_module
+from physjax.particles import Particles, demand_particles
+from physjax.scene import as_module
 from physjax.vectors import components, stacked
 
 
@@ -59,11 +60,7 @@ class Pins(eqx.Module):
 
     def prepared(self, state: Any) -> "Pins":
         """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
-        if not isinstance(state, Particles):
-            raise TypeError(
-                f"Pins: got a state of type {type(state).__name__}, expected Particles: bodies cannot be led yet. Hold "
-                "one with a mask, pinned=mask, or by a point of itself, mass=inertia.about(pivot)."
-            )
+        demand_particles("Pins", state, "bodies are held by a mask, or by a point of theirs, mass=inertia.about(point)")
         if self.nodes.shape != state.lanes:
             raise ValueError(
                 f"Pins: got nodes of shape {self.nodes.shape}, expected booleans of the lanes' shape {state.lanes}."

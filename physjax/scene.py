@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import demand_legal
 from physjax.lanes import WHOLE, kept_apart
-from physjax.particles import Particles, added, shaped
+from physjax.particles import Particles, added, demand_particles, shaped
 from physjax.vectors import scale
 
 
@@ -152,10 +152,8 @@ class Scene(eqx.Module):
         self.mass = mass
         self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
         contacts = [_part("contact", contact, dtype) for contact in _listed("contact", contacts)]
-        if contacts and not isinstance(state, Particles):
-            raise TypeError(
-                f"contacts: got a state of type {type(state).__name__}, expected Particles: only they touch."
-            )
+        if contacts:
+            demand_particles("contacts", state, "nothing else touches yet")
         for contact in contacts:
             demand_legal(contact, state)
         self.contacts = tuple(contact.prepared(state, self.couples) for contact in contacts)

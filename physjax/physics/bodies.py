@@ -96,6 +96,11 @@ class RigidBodies(NamedTuple):
         """Floating-point type, which every number of the scene follows."""
         return self.position.dtype
 
+    @property
+    def place(self) -> np.ndarray:
+        """What the errors of a path are measured by: position [m] and orientation [1] beside each other, `(*lanes, 7)`."""
+        return np.concatenate([self.position, self.orientation], axis=-1)
+
     # loads
 
     def shown_to(self, force: Any, mass: Inertia) -> tuple[Any, Any]:

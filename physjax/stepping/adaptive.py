@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
+from physjax.particles import demand_particles
 from physjax.scene import as_module
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 5.0
@@ -103,6 +104,7 @@ class Adaptive(eqx.Module):
     def _error(self, start: Any, whole: Any, halves: Any, shape: tuple) -> Array:
         """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
         if self.error == "velocity":
+            demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
             difference = halves.velocity - whole.velocity
             worst = jnp.sqrt(jnp.sum(difference * difference, axis=-1))
             return jnp.max(worst.reshape((*shape, -1)), axis=-1) / self.atol.astype(worst.dtype)

@@ -15,7 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.scene import Force, Particles, Scene
+from physjax.particles import Particles, demand_particles
+from physjax.scene import Force, Scene
 
 DENSE = 300
 """Coordinates of a scene up to which all its modes are found; of larger ones those that move fastest."""
@@ -58,6 +59,7 @@ class SmallMotion(NamedTuple):
 
 def small_motion(scene: Scene, state: Particles) -> SmallMotion:
     """K and C of a scene about a state; held lanes do not move. Of large coupled scenes, their fastest modes."""
+    demand_particles("small motions", state, "what turns is not linearised")
     inside = scene.state.lanes[-1:] if scene.couples else ()
     size = int(np.prod(inside)) * state.position.shape[-1]
     if size <= DENSE:

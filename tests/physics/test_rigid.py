@@ -361,7 +361,7 @@ def begun(**changes):
         (lambda: Scene(begun(momentum=jnp.full(3, jnp.nan)), BRICK), "finite"),
         (lambda: Scene(begun(), inertia.box(jnp.ones(3), (1, 1, 1))), "Inertia: got mass"),
         (lambda: Scene(begun(), BRICK, contacts=(contacts.Plane((0, 0, 0), (0, 1, 0)),)), "expected Particles"),
-        (lambda: Scene(begun(), BRICK, pinned=Pins(jnp.asarray(True), lambda t: jnp.zeros(3))), "cannot be led"),
+        (lambda: Scene(begun(), BRICK, pinned=Pins(jnp.asarray(True), lambda t: jnp.zeros(3))), "held by a mask"),
         (lambda: loads(Scene(Particles(jnp.zeros(3), jnp.zeros(3)), 1.0, (rigid.Torque((1, 0, 0.0)),)), 0.0), "RigidBodies"),
         (lambda: rigid.Torque((1, 0, 0.0), frame="moon"), "'world' or 'body'"),
         (lambda: rigid.AtPoint((0, 0, 0), rigid.Torque((1, 0, 0.0))), "force on particles"),
