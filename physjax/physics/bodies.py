@@ -117,9 +117,9 @@ class RigidBodies(NamedTuple):
 
     def total(self, terms: Any) -> Wrench:
         """The sum of wrenches, both parts present."""
-        parts = ([part for part in parts if part is not None] for parts in zip(*terms, strict=True))
-        parts = parts if terms else ([], [])
-        return Wrench(*(added(part) if part else jnp.zeros_like(self.position) for part in parts))
+        kinds = zip(*terms, strict=True) if terms else ((), ())
+        present = ([part for part in parts if part is not None] for parts in kinds)
+        return Wrench(*(added(parts) if parts else jnp.zeros_like(self.position) for parts in present))
 
     def driven(self, scene: Any, t: ArrayLike) -> Wrench:
         """Total force and torque; none on bodies that are held."""
@@ -138,7 +138,7 @@ class RigidBodies(NamedTuple):
         if inertia.arm is None:
             return RigidBodies(scale(1 / inertia.mass, self.momentum), turning, force, torque)
         omega = angular_velocity(self, inertia)
-        arm = turn(self.orientation, over(inertia.arm, self.position))
+        arm = in_world(self, inertia.arm)
         torque = torque + cross(arm, force)
         velocity = cross(omega, arm)
         change = angular_acceleration(self, inertia, torque)
@@ -165,7 +165,7 @@ class RigidBodies(NamedTuple):
         """The state with position and momentum as orientation and angular momentum say, where there is a pivot."""
         if inertia.arm is None:
             return self
-        arm = turn(self.orientation, over(inertia.arm, self.position))
+        arm = in_world(self, inertia.arm)
         velocity = cross(angular_velocity(self, inertia), arm)
         return self._replace(position=over(inertia.pivot, self.position) + arm, momentum=scale(inertia.mass, velocity))
 
@@ -192,7 +192,7 @@ class RigidBodies(NamedTuple):
         """Angular momentum about the centre of mass [kg m²/s], also where the state's own is about a pivot."""
         if inertia.arm is None:
             return self.angular_momentum
-        arm = turn(self.orientation, over(inertia.arm, self.position))
+        arm = in_world(self, inertia.arm)
         return self.angular_momentum - cross(arm, self.momentum)
 
     # checks
@@ -219,12 +219,17 @@ class RigidBodies(NamedTuple):
         state = state._replace(orientation=real_turn("orientation", state.orientation))
         inertia = mass.checked(lanes, dtype)
         if inertia.arm is not None:
-            pivot = state.position - turn(state.orientation, over(inertia.arm, state.position))
+            pivot = state.position - in_world(state, inertia.arm)
             inertia = inertia.hung(pivot)
         return state.on_pivot(inertia), inertia
 
 
 # how bodies turn
+
+
+def in_world(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]:
+    """A vector of each body's frame, one for all or one per lane, in the world's frame: R v."""
+    return turn(bodies.orientation, over(jnp.asarray(vector, bodies.dtype), bodies.position))
 
 
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:

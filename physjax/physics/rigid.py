@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from physjax.checks import quantity, real_quantity
 from physjax.particles import Particles
-from physjax.physics.bodies import Load, OnBodies, RigidBodies, Wrench, angular_acceleration, angular_velocity
+from physjax.physics.bodies import Load, OnBodies, RigidBodies, Wrench, angular_acceleration, angular_velocity, in_world
 from physjax.physics.inertia import Inertia, real_turn
 from physjax.scene import Force, Scene, as_module
 from physjax.vectors import cross, over, scale, turn, turn_back
@@ -84,12 +84,12 @@ def on_bodies(function: Callable, *, couples: bool = False) -> Load:
 
 def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
     """Where a point of each body is [m]: x + R p."""
-    return bodies.position + _arm(bodies, place)
+    return bodies.position + in_world(bodies, place)
 
 
 def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> Float[Array, "*lanes 3"]:
     """How fast a point of each body is [m/s]: v + ω × r."""
-    return scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), _arm(bodies, place))
+    return scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), in_world(bodies, place))
 
 
 def point_acceleration(
@@ -97,14 +97,9 @@ def point_acceleration(
 ) -> Float[Array, "*lanes 3"]:
     """Acceleration of a point of each body [m/s²]: a + ω̇ × r + ω × (ω × r), at `scene.state` unless a state is given."""
     state = scene.state if state is None else state
-    rate, r = scene.rate(t, state), _arm(state, place)
+    rate, r = scene.rate(t, state), in_world(state, place)
     omega, change = angular_velocity(state, scene.mass), angular_acceleration(state, scene.mass, rate.angular_momentum)
     return scale(1 / scene.mass.mass, rate.momentum) + cross(change, r) + cross(omega, cross(omega, r))
-
-
-def _arm(bodies: RigidBodies, place: ArrayLike) -> Array:
-    """From the centre of mass to a point of the body, in the world's frame."""
-    return turn(bodies.orientation, over(jnp.asarray(place, bodies.dtype), bodies.position))
 
 
 # loads
@@ -121,8 +116,8 @@ class Torque(Load):
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """No force, the torque."""
-        torque = over(self.torque, bodies.position)
-        return Wrench(torque=torque if self.frame == "world" else turn(bodies.orientation, torque))
+        world = self.frame == "world"
+        return Wrench(torque=over(self.torque, bodies.position) if world else in_world(bodies, self.torque))
 
 
 class RotationalDrag(Load):
@@ -143,8 +138,8 @@ class Thrust(Load):
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
-        force = turn(bodies.orientation, over(self.force, bodies.position))
-        return Wrench(force, cross(_arm(bodies, self.point), force))
+        force = in_world(bodies, self.force)
+        return Wrench(force, cross(in_world(bodies, self.point), force))
 
 
 class AtPoint(Load):
@@ -192,7 +187,7 @@ class AtPoint(Load):
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
         force = self.force(t, self._seen(bodies, inertia), inertia.mass)
-        return Wrench(force, cross(_arm(bodies, self.point), force))
+        return Wrench(force, cross(in_world(bodies, self.point), force))
 
     def _seen(self, bodies: RigidBodies, inertia: Inertia) -> Particles:
         return Particles(point(bodies, self.point), point_velocity(bodies, inertia, self.point))
