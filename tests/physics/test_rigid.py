@@ -89,15 +89,8 @@ def test_a_quaternion_stays_of_length_one_and_angular_momentum_what_it_was(metho
 
 
 def test_adaptive_steps_turn_bodies_as_well():
-    film = simulate(HUNG, methods.adaptive(methods.rk4, 1e-10, 1e-10), dt=0.5, steps=4)
-    true = reference(HUNG, [2.0], rtol=1e-13, atol=1e-13)
-    assert angle(film.state.orientation[-1], true.state.orientation[-1]) < 1e-8
-
-
-def test_implicit_steps_say_that_their_equations_are_solved():
-    solved = methods.implicit_euler.report(HUNG, 0.1)
-    assert bool(solved.ok)
-    assert int(solved.products) <= 40
+    film = simulate(FREE, methods.adaptive(methods.rk4, 1e-10, 1e-10), dt=0.5, steps=4)
+    assert angle(film.state.orientation[-1], truth("free")) < 1e-8
 
 
 # ten thousand turns
@@ -283,7 +276,7 @@ def test_lanes_and_one_by_one_agree_in_both_precisions(precision):
 
     def run(state, body):
         fall = Scene(state, body, (forces.Gravity(),))
-        return simulate(fall, methods.verlet, dt=0.01, steps=50, save_every=50).final_scene.state
+        return simulate(fall, methods.verlet, dt=0.03, steps=16, save_every=16).final_scene.state
 
     together = run(rigid.bodies(bricks, x, q, v, omega), bricks)
     mapped = jax.vmap(lambda m, p, *s: run(rigid.bodies(Inertia(m, p), *s), Inertia(m, p)))(
@@ -291,7 +284,7 @@ def test_lanes_and_one_by_one_agree_in_both_precisions(precision):
     )
     for a, b in zip(together, mapped, strict=True):
         assert a.dtype == precision.dtype
-        np.testing.assert_allclose(a, b, rtol=0, atol=2e3 * precision.eps)
+        np.testing.assert_allclose(a, b, rtol=0, atol=200 * precision.eps)
 
 
 @pytest.mark.parametrize("method", [methods.verlet, methods.rk4])
@@ -300,7 +293,7 @@ def test_gradients_through_a_free_turn_agree_with_differences(method):
     def outcome(numbers):
         body = Inertia(1.0, numbers[:3])
         scene = Scene(rigid.bodies(body, angular_velocity=numbers[3:]), body)
-        q = simulate(scene, method, dt=0.01, steps=200, save_every=200).final_scene.state.orientation
+        q = simulate(scene, method, dt=0.1, steps=16, save_every=16).final_scene.state.orientation
         return jnp.vdot(q, jnp.asarray([0.3, -0.7, 0.2, 0.9]))
 
     at, h = jnp.asarray([1.0, 1.5, 2.0, *OMEGA]), 1e-5
