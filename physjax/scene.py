@@ -300,6 +300,12 @@ def as_module(function: Callable) -> eqx.Module:
     return function if isinstance(function, eqx.Module) else Function(function)
 
 
+def plain_functions(part: Any) -> list[Function]:
+    """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
+    is_plain = lambda node: isinstance(node, Function)  # noqa: E731
+    return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
+
+
 def _listed(kind: str, parts: Any) -> tuple:
     """The parts as a tuple; a single one given without it is an easy slip and gets an error that says so."""
     if callable(parts) or not hasattr(parts, "__iter__"):

@@ -19,7 +19,7 @@ from physjax.checks import real_array, real_quantity
 from physjax.lanes import kept_apart
 from physjax.particles import Particles, added, shaped
 from physjax.physics.inertia import Inertia, real_turn
-from physjax.scene import Force, loads
+from physjax.scene import Force, Function, loads
 from physjax.vectors import (
     components,
     composed,
@@ -61,11 +61,11 @@ class Load(Force):
 class OnBodies(Load):
     """A plain function `(t, bodies, inertia) -> Wrench` as a load, for each body by itself unless it `couples`."""
 
-    function: Callable = eqx.field(static=True)
+    function: Function
     couples: bool = eqx.field(static=True)
 
     def __init__(self, function: Callable, couples: bool = False):
-        self.function = function
+        self.function = Function(function)
         self.couples = couples
 
     def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:

@@ -266,6 +266,21 @@ def test_a_plain_function_is_a_load_when_it_is_told_so():
     assert not end.couples
 
 
+def test_a_plain_load_that_closes_over_what_is_traced_runs_inside_jit():
+    @jax.jit
+    def spun(strength):
+        twist = rigid.on_bodies(
+            lambda t, bodies, inertia: rigid.Wrench(torque=jnp.stack([0 * strength, 0 * strength, strength]))
+        )
+        pull = rigid.AtPoint((0.0, 0, 0), forces.independent(lambda t, state, mass: strength + 0 * state.position))
+        run = simulate(Scene(rigid.bodies(BRICK), BRICK, (twist, pull)), methods.rk4, dt=0.1, steps=10)
+        return run.final_scene.state
+
+    end = spun(jnp.asarray(0.5))
+    np.testing.assert_allclose(end.angular_momentum, [0, 0, 0.5], atol=1e-14)
+    np.testing.assert_allclose(end.momentum, 0.5, atol=1e-14)
+
+
 # lanes, derivatives
 
 
