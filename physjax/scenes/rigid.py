@@ -21,18 +21,19 @@ def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
 
     Seen from the world the axis goes round at |L|/I₁, seen from the disc ω does at (I₃ - I₁)ω₃/I₁.
     """
-    disc = inertia.cylinder(0.2, radius=0.1, length=0.02)
+    mass, velocity = 0.2, np.array([2.0, 3.0, 0.0])
+    disc = inertia.cylinder(mass, radius=0.1, length=0.02)
     i1, _, i3 = np.asarray(disc.principal, float)
     momentum = np.array([i1 * wobble, 0.0, i3 * spin])
     size = np.linalg.norm(momentum)
     slip = (i3 - i1) * spin / i1
-    thrown = Scene(rigid.bodies(disc, velocity=(2.0, 3.0, 0.0), angular_velocity=(wobble, 0.0, spin)), disc)
+    thrown = Scene(rigid.bodies(disc, velocity=velocity, angular_velocity=(wobble, 0.0, spin)), disc)
 
     def exact(t):
         q = composed(_about(momentum / size, size / i1 * t), _about(OWN, -slip * t))
-        path = np.multiply.outer(t, [2.0, 3.0, 0.0])
-        p, spin = (np.broadcast_to(a, path.shape) for a in (0.2 * np.array([2.0, 3.0, 0.0]), momentum))
-        return rigid.RigidBodies(path, np.stack(q, axis=-1), p, spin)
+        path = np.multiply.outer(t, velocity)
+        kept = (np.broadcast_to(a, path.shape) for a in (mass * velocity, momentum))
+        return rigid.RigidBodies(path, np.stack(q, axis=-1), *kept)
 
     return Problem(
         thrown,
@@ -57,9 +58,10 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
 
     Ω = [I₃ω₃ ± √(I₃²ω₃² - 4I₁mgl cosθ)]/(2I₁cosθ), I₁ about the tip; there is no nutation at exactly these.
     """
-    top = inertia.cylinder(0.2, radius=0.06, length=0.02).about((0.0, 0.0, -length))
+    mass = 0.2
+    top = inertia.cylinder(mass, radius=0.06, length=0.02).about((0.0, 0.0, -length))
     i1, _, i3 = np.asarray(top.principal, float)
-    root = np.sqrt((i3 * spin) ** 2 - 4 * i1 * 0.2 * g * length * np.cos(tilt))
+    root = np.sqrt((i3 * spin) ** 2 - 4 * i1 * mass * g * length * np.cos(tilt))
     pace = (i3 * spin + np.array([-1.0, 1.0]) * root) / (2 * i1 * np.cos(tilt))
     own = spin - pace * np.cos(tilt)
     axis = np.array([np.sin(tilt), np.cos(tilt), 0.0])
@@ -72,7 +74,7 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
         round_about = _about(UP, np.multiply.outer(t, pace))
         q = composed(composed(round_about, start), _about(OWN, np.multiply.outer(t, own)))
         arm = np.stack(turned(round_about, list(length * axis)), axis=-1)
-        momentum = 0.2 * np.stack([pace * arm[..., 2], 0 * pace * arm[..., 0], -pace * arm[..., 0]], axis=-1)
+        momentum = mass * np.cross(np.outer(pace, UP), arm)
         first = np.outer(i3 * spin * np.ones(2), axis) + i1 * (omega - spin * axis)
         spins = np.stack(turned(round_about, list(first.T)), axis=-1)
         return rigid.RigidBodies(arm + place - length * axis, np.stack(q, axis=-1), momentum, spins)
@@ -139,9 +141,9 @@ def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
 @scene
 def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.8) -> Problem:
     """A plank that swings from one end, far out: its period is 4K(sin θ₀/2)√(I/mgl), I about the pivot."""
-    arm = 0.45 * length
-    plank = inertia.box(1.5, (0.08, length, 0.02)).about((0.0, arm, 0.0))
-    swing = np.sqrt(float(plank.principal[2]) / (1.5 * g * arm))
+    mass, arm = 1.5, 0.45 * length
+    plank = inertia.box(mass, (0.08, length, 0.02)).about((0.0, arm, 0.0))
+    swing = np.sqrt(float(plank.principal[2]) / (mass * g * arm))
     period = 4 * complete_elliptic(np.sin(amplitude / 2)) * swing
     place = arm * np.array([np.sin(amplitude), -np.cos(amplitude), 0.0])
     start = np.stack(_about((0.0, 0.0, 1.0), amplitude))
