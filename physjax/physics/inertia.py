@@ -15,7 +15,7 @@ from numpy.linalg import eigh
 
 from physjax.checks import concrete, demand, real_quantity
 from physjax.physics.meshes import checked_mesh
-from physjax.vectors import dot, scale
+from physjax.vectors import components, dot, scale
 
 
 class Inertia(eqx.Module):
@@ -60,14 +60,13 @@ class Inertia(eqx.Module):
         """
         if self.arm is not None:
             raise ValueError("about: got an inertia with a pivot, expected one about the centre of mass.")
-        parts = list(point) if isinstance(point, list | tuple) else [jnp.asarray(point)[..., i] for i in range(3)]
+        parts = _components("pivot [m]", point)
         away = [i for i, part in enumerate(parts) if concrete(part) is None or np.any(concrete(part))]
-        parts = [real_quantity("pivot [m]", part) for part in parts]
         point = jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
         if self.axes is None and len(away) <= 1:
             square = self.mass * dot(point, point)
             more = [jnp.zeros_like(square) if [i] == away else square for i in range(3)]
-            body = Inertia(self.mass, self.principal + jnp.stack(more, axis=-1))
+            body = Inertia(self.mass, sum(jnp.broadcast_arrays(self.principal, jnp.stack(more, axis=-1))))
         else:
             body = of_tensor(self.mass, self.tensor + _moved(*_on_host("pivot", self.mass, point)))
         return eqx.tree_at(lambda body: body.arm, body, -point, is_leaf=lambda leaf: leaf is None)
@@ -225,6 +224,17 @@ def real_turn(name: str, value: Any) -> Float[Array, "*lanes 4"]:
             name, q, np.any(concrete(q) != 0, axis=-1, keepdims=True) | np.zeros(q.shape, bool), "a quaternion not zero"
         )
     return scale(1 / jnp.sqrt(dot(q, q)), q)
+
+
+def _components(name: str, vector: Any) -> list[Array]:
+    """The components of a vector one by one; written as a tuple of three, each may be traced or not."""
+    if isinstance(vector, list | tuple) and not isinstance(vector[0], list | tuple):
+        parts = [real_quantity(name, part) for part in vector]
+    else:
+        parts = components(real_quantity(name, vector))
+    if len(parts) != 3:
+        raise ValueError(f"{name}: got {len(parts)} components, expected 3.")
+    return parts
 
 
 def _real_moments(value: Any) -> Float[Array, "*lanes 3"]:

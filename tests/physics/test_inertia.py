@@ -105,6 +105,10 @@ def test_sizes_and_masses_are_swept():
     np.testing.assert_allclose(found, inertia.box(jnp.ones(5), jnp.ones((5, 3))).principal)
     assert inertia.sphere(2.0, jnp.ones(4)).principal.shape == (4, 3)
     assert inertia.cylinder(jnp.ones(4), 1.0, jnp.ones(4)).principal.shape == (4, 3)
+    hung = inertia.box(jnp.arange(1.0, 5.0), (1.0, 1, 1)).about((0, 0, 0.5))
+    np.testing.assert_allclose(hung.principal[:, 0], np.arange(1, 5) * (1 / 6 + 1 / 4), rtol=1e-14)
+    many = inertia.box(1.0, (1.0, 1, 1)).about([[0, 0, 0.5], [0, 0.5, 0], [1.0, 0, 0.5], [0, 0, 0]])
+    assert many.principal.shape == (4, 3)
 
 
 @pytest.mark.usefixtures("unannotated")
@@ -130,6 +134,7 @@ def test_sizes_and_masses_are_swept():
         (lambda: inertia.points([1.0, 1.0], [[0, 0, 0.0]]), "positions"),
         (lambda: inertia.composite([]), "for each part"),
         (lambda: inertia.box(1.0, (1, 1, 1)).about((0, 0, 1)).about((0, 0, 1)), "with a pivot"),
+        (lambda: inertia.box(1.0, (1, 1, 1)).about((0, 1)), "expected 3"),
         (lambda: jax.jit(lambda p: inertia.box(1.0, (1, 2, 3)).about(p).mass)(jnp.ones(3)), "is being traced"),
     ],
 )
