@@ -35,7 +35,7 @@ from physjax.files import replacing, writable_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "numba", "warp-lang", "taichi")
+PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "numba", "warp-lang", "taichi", "mujoco-mjx")
 TURN = 0.5
 """Seconds of a turn."""
 COLOURS = {"physjax": "#0072B2", "other JAX code": "#E69F00", "without JAX": "#999999"}

@@ -13,7 +13,9 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from physjax import scenes
-    from physjax.physics import contacts, lattices, springs
+    from physjax.physics import contacts, inertia, lattices, rigid, springs
+    from physjax.physics.inertia import Inertia
+    from physjax.physics.rigid import RigidBodies
     from physjax.show import animate, plot
     from physjax.study import accuracy, energy, gradients, projectile, stability
     from physjax.study.aim import aim_at
@@ -24,8 +26,10 @@ __all__ = [
     "Contact",
     "Field",
     "Force",
+    "Inertia",
     "Particles",
     "Pins",
+    "RigidBodies",
     "Scene",
     "Trajectory",
     "accuracy",
@@ -36,6 +40,7 @@ __all__ = [
     "fit",
     "forces",
     "gradients",
+    "inertia",
     "lattices",
     "loads",
     "methods",
@@ -44,6 +49,7 @@ __all__ = [
     "plot",
     "projectile",
     "reference",
+    "rigid",
     "scenes",
     "simulate",
     "solve",
@@ -54,6 +60,8 @@ __version__ = "0.1.0"
 
 # loaded when first named: what not every run needs should not make `import physjax` slower
 _LATER = {
+    "Inertia": "physjax.physics.inertia:Inertia",
+    "RigidBodies": "physjax.physics.rigid:RigidBodies",
     "accuracy": "physjax.study.accuracy",
     "aim_at": "physjax.study.aim:aim_at",
     "animate": "physjax.show.animate",
@@ -61,10 +69,12 @@ _LATER = {
     "energy": "physjax.study.energy",
     "fit": "physjax.study.fit:fit",
     "gradients": "physjax.study.gradients",
+    "inertia": "physjax.physics.inertia",
     "lattices": "physjax.physics.lattices",
     "minimise": "physjax.study.solve:minimise",
     "plot": "physjax.show.plot",
     "projectile": "physjax.study.projectile",
+    "rigid": "physjax.physics.rigid",
     "scenes": "physjax.scenes",
     "solve": "physjax.study.solve:solve",
     "springs": "physjax.physics.springs",

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from physjax.checks import quantity
 from physjax.lanes import any_lane, wide
 from physjax.loops import repeat, time_at
+from physjax.particles import demand_particles
 from physjax.roots import first_root
 from physjax.scene import as_module
 from physjax.vectors import norm
@@ -48,6 +49,7 @@ class Height(eqx.Module):
 
 def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
+    demand_particles("crossing", run.scene.state, "of bodies record the gap instead")
     if direction not in (None, 1, -1):
         raise ValueError(
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."

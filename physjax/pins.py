@@ -12,7 +12,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete
-from physjax.scene import Particles, as_module
+from physjax.particles import Particles, demand_particles
+from physjax.scene import as_module
 from physjax.vectors import components, stacked
 
 
@@ -57,8 +58,9 @@ class Pins(eqx.Module):
         _, bend = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
         return self._on_led(bend, acceleration)
 
-    def prepared(self, state: Particles) -> "Pins":
+    def prepared(self, state: Any) -> "Pins":
         """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
+        demand_particles("Pins", state, "bodies are held by a mask, or by a point of theirs, mass=inertia.about(point)")
         if self.nodes.shape != state.lanes:
             raise ValueError(
                 f"Pins: got nodes of shape {self.nodes.shape}, expected booleans of the lanes' shape {state.lanes}."

@@ -8,7 +8,7 @@ earlier axes count scenes. A per-lane number is a scalar or has the shape of the
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -17,65 +17,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import demand_legal, real_array, real_quantity
+from physjax.checks import demand_legal
 from physjax.lanes import WHOLE, kept_apart
+from physjax.particles import Particles, added, demand_particles, shaped
 from physjax.vectors import scale
-
-
-class Particles(NamedTuple):
-    """Point masses: position [m] and velocity [m/s], both `(*lanes, dim)`.
-
-    The record knows how Newton's law moves it, so that the methods need no physics: `rate` is its time derivative,
-    `kick` changes the velocity and leaves the position, `drift` moves the position with the velocity it has.
-    """
-
-    position: Float[Array, "*lanes dim"]
-    velocity: Float[Array, "*lanes dim"]
-
-    @property
-    def lanes(self) -> tuple[int, ...]:
-        """Shape of the lanes: `()` for a single particle."""
-        return self.position.shape[:-1]
-
-    @property
-    def dtype(self) -> np.dtype:
-        """Floating-point type, which every number of the scene follows."""
-        return self.position.dtype
-
-    def rate(self, acceleration: Float[Array, "*lanes dim"]) -> "Particles":
-        """Time derivative: position changes with the velocity, velocity with the acceleration."""
-        return Particles(self.velocity, acceleration)
-
-    def kick(self, rate: "Particles", dt: ArrayLike) -> "Particles":
-        """v += a dt, the position untouched."""
-        return Particles(self.position, self.velocity + scale(dt, rate.velocity))
-
-    def drift(self, dt: ArrayLike) -> "Particles":
-        """x += v dt, the velocity untouched."""
-        return Particles(self.position + scale(dt, self.velocity), self.velocity)
-
-    def held(self, free: Float[Array, "*lanes"]) -> "Particles":
-        """The state with the velocity of held lanes (free = 0) set to zero."""
-        return Particles(self.position, scale(free, self.velocity))
-
-    def checked(self) -> "Particles":
-        """The state as floating-point arrays of one shape and dtype; ValueError or TypeError in plain words otherwise."""
-        state = Particles(real_array("position", self.position), real_array("velocity", self.velocity))
-        x, v = state
-        if x.ndim == 0 or x.shape != v.shape:
-            raise ValueError(
-                f"Particles: got position {x.shape} and velocity {v.shape}, expected the same shape (*lanes, dim): "
-                "component last, e.g. (2,) for one ball in the plane, (10000, 3) for ten thousand in space."
-            )
-        if 0 in x.shape:
-            raise ValueError(f"Particles: got the empty shape {x.shape}, expected at least one lane and one component.")
-        if x.dtype != v.dtype:
-            raise TypeError(
-                f"Particles: got position {x.dtype} and velocity {v.dtype}, expected one dtype. Cast one of them."
-            )
-        for name, array in (("position [m]", x), ("velocity [m/s]", v)):
-            real_quantity(name, array)
-        return Particles(x.astype(x.dtype), v.astype(v.dtype))  # astype makes weakly typed arrays strong
 
 
 class Force(eqx.Module):
@@ -164,14 +109,15 @@ class Function(eqx.Module):
 class Scene(eqx.Module):
     """Everything a run needs but the method: state, mass [kg], forces, contacts, and which lanes are held or led.
 
-    `mass` is a scalar or per lane. `forces` are library forces or any callable `(t, state, mass) -> newtons`. `pinned`
-    is a boolean mask over the lanes that are held, or `Pins(nodes, path)`, which leads them. Every number becomes an
-    array of the state's dtype: changing it compiles nothing, and it can be swept and differentiated. Raises ValueError
-    or TypeError for shapes that do not match, numbers that are not finite, and masses <= 0.
+    `mass` is a scalar or per lane, an `Inertia` for rigid bodies. `forces` are library forces or any callable
+    `(t, state, mass) -> newtons`. `pinned` is a boolean mask over the lanes that are held, or `Pins(nodes, path)`, which
+    leads them. Every number becomes an array of the state's dtype: changing it compiles nothing, and it can be swept
+    and differentiated. Raises ValueError or TypeError for shapes that do not match, numbers that are not finite, and
+    masses <= 0.
     """
 
-    state: Particles
-    mass: Float[Array, "..."]
+    state: Any
+    mass: Any
     forces: tuple
     contacts: tuple
     pinned: Bool[Array, "*lanes"] | eqx.Module | None
@@ -187,13 +133,11 @@ class Scene(eqx.Module):
     ):
         if not hasattr(state, "checked"):
             raise TypeError(
-                f"Scene: got a state of type {type(state).__name__}, expected Particles(position, velocity)."
+                f"Scene: got a state of type {type(state).__name__}, expected Particles(position, velocity), "
+                "or RigidBodies(position, orientation, momentum, angular_momentum)."
             )
-        state = state.checked()
+        state, mass = state.checked(mass)
         lanes, dtype = state.lanes, state.dtype
-        mass = real_quantity("mass [kg]", mass, above=0.0).astype(dtype)
-        if mass.shape not in ((), lanes):
-            raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {lanes}.")
         if hasattr(pinned, "lead"):
             pinned = pinned.prepared(state)
             state = pinned.lead(0.0, state)
@@ -208,6 +152,8 @@ class Scene(eqx.Module):
         self.mass = mass
         self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
         contacts = [_part("contact", contact, dtype) for contact in _listed("contact", contacts)]
+        if contacts:
+            demand_particles("contacts", state, "nothing else touches yet")
         for contact in contacts:
             demand_legal(contact, state)
         self.contacts = tuple(contact.prepared(state, self.couples) for contact in contacts)
@@ -244,47 +190,55 @@ class Scene(eqx.Module):
         if self.led is not None:
             state = self.led.lead(t, state)
         free = None if self.held is None else 1 - self.held.astype(state.dtype)
-        fields = [_shaped(f, f.acceleration(t, state, self.mass), state) for f in self.forces if isinstance(f, Field)]
-        newtons = [_shaped(f, f(t, state, self.mass), state) for f in self.forces if not isinstance(f, Field)]
+        fields = [f for f in self.forces if isinstance(f, Field)]
+        fields = [shaped(f, f.acceleration(t, state, self.mass), state.velocity) for f in fields]
+        newtons = [state.load(f, t, self.mass) for f in self.forces if not isinstance(f, Field)]
         total = []
         if fields:
-            total.append(_sum(fields) if free is None else scale(free, _sum(fields)))
+            total.append(added(fields) if free is None else scale(free, added(fields)))
         if newtons:
-            total.append(scale((1.0 if free is None else free) / self.mass, _sum(newtons)))
-        acceleration = _sum(total) if total else jnp.zeros_like(state.velocity)
+            total.append(scale((1.0 if free is None else free) / self.mass, added(newtons)))
+        acceleration = added(total) if total else jnp.zeros_like(state.velocity)
         if self.led is not None:
             acceleration = self.led.drive(t, state, acceleration)
         return acceleration if self.reaction is None else self.reaction(t, state, acceleration)
 
-    def rate(self, t: ArrayLike, state: Particles) -> Particles:
+    def rate(self, t: ArrayLike, state: Any) -> Any:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.in_pieces:
-            return state.rate(self.acceleration(t, state))
+            return state.rate(state.driven(self, t), self.mass)
         # apart, or a method's stage would be computed anew in every neighbour that looks at it
-        return state.rate(kept_apart(t, lambda: self.acceleration(t, state)))
+        return state.rate(kept_apart(t, lambda: state.driven(self, t)), self.mass)
 
-    def kick(self, state: Particles, rate: Particles, dt: ArrayLike) -> Particles:
-        """Velocities changed by the accelerations in `rate` for a time dt."""
+    def kick(self, state: Any, rate: Any, dt: ArrayLike) -> Any:
+        """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""
         return state.kick(rate, dt)
 
-    def drift(self, state: Particles, dt: ArrayLike) -> Particles:
-        """Positions moved by the velocities in `state` for a time dt."""
-        return state.drift(dt)
+    def drift(self, state: Any, dt: ArrayLike) -> Any:
+        """Positions (of bodies also orientations) moved by the velocities in `state` for a time dt."""
+        return state.drift(dt, self.mass)
+
+    def settled(self, state: Any) -> Any:
+        """The state as it must be after a step, where its arrays have to agree with each other."""
+        return state.settled(self.mass) if hasattr(state, "settled") else state
 
     def during(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene as one step sees it: forces that jump in time replaced by their mean over the step."""
-        forces = tuple(f.during(t, dt, self.state) if hasattr(f, "during") else f for f in self.forces)
+        see = lambda f: self.state.shown_to(f, self.mass)[0]  # noqa: E731
+        forces = tuple(f.during(t, dt, see(f)) if hasattr(f, "during") else f for f in self.forces)
         return eqx.tree_at(lambda scene: scene.forces, self, forces)
 
     @property
     def definite(self) -> bool:
         """Whether every force pushes back, symmetrically: an implicit step may then use conjugate gradients."""
-        return all(getattr(force, "definite", False) for force in self.forces)
+        flat = not hasattr(self.state, "settled")  # what turns pushes back in no symmetric way
+        return flat and all(getattr(force, "definite", False) for force in self.forces)
 
-    def near(self, t: ArrayLike, state: Particles) -> "Scene":
+    def near(self, t: ArrayLike, state: Any) -> "Scene":
         """The scene as an implicit step sees it: forces that have a tangent at this state replaced by it."""
         state = state if self.led is None else self.led.lead(t, state)
-        return self.having(forces=tuple(f.near(t, state, self.mass) if hasattr(f, "near") else f for f in self.forces))
+        see = lambda f: state.shown_to(f, self.mass)  # noqa: E731
+        return self.having(forces=tuple(f.near(t, *see(f)) if hasattr(f, "near") else f for f in self.forces))
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
@@ -307,7 +261,9 @@ class Scene(eqx.Module):
         forces, state = list(self.forces), self.state
         for i, force in enumerate(forces):
             if hasattr(force, "advance"):
-                forces[i], state = force.advance(t, dt, state)
+                seen, _ = state.shown_to(force, self.mass)
+                forces[i], after = force.advance(t, dt, seen)
+                state = after if seen is state else state
         return self.having(state=state, forces=tuple(forces))
 
     def having(self, **parts: Any) -> "Scene":
@@ -316,7 +272,7 @@ class Scene(eqx.Module):
         where = lambda scene: [getattr(scene, name) for name in names]  # noqa: E731
         return eqx.tree_at(where, self, list(parts.values()), is_leaf=lambda leaf: leaf is None)
 
-    def finite(self, state: Particles) -> Bool[Array, "..."]:
+    def finite(self, state: Any) -> Bool[Array, "..."]:
         """Whether the state is finite, per lane, or per scene where lanes are coupled."""
         status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
         good = jnp.all(jnp.stack(status), axis=0)
@@ -325,25 +281,29 @@ class Scene(eqx.Module):
 
 def _free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """A step of the method as if nothing were in the way."""
-    return scene.having(state=method(scene.during(t, dt), t, scene.state, dt))
+    return scene.having(state=scene.settled(method(scene.during(t, dt), t, scene.state, dt)))
 
 
-def loads(scene: Scene, t: ArrayLike, state: Particles | None = None, *, per_term: bool = False) -> Any:
+def loads(scene: Scene, t: ArrayLike, state: Any = None, *, per_term: bool = False) -> Any:
     """Total force on each lane [N] (the lecture's ComputeTotalForce), at `scene.state` unless a state is given.
 
-    Returns an array shaped like the velocity; with `per_term=True` a tuple of such arrays, one for each of
-    `scene.forces`.
+    Returns an array shaped like the velocity, for rigid bodies a `Wrench` of force [N] and torque about the centre of
+    mass [N m]; with `per_term=True` a tuple of such, one for each of `scene.forces`.
     """
     state = scene.state if state is None else state
-    terms = tuple(_shaped(force, force(t, state, scene.mass), state) for force in scene.forces)
-    if per_term:
-        return terms
-    return _sum(terms) if terms else jnp.zeros_like(state.velocity)
+    terms = tuple(state.load(force, t, scene.mass) for force in scene.forces)
+    return terms if per_term else state.total(terms)
 
 
 def as_module(function: Callable) -> eqx.Module:
     """A plain function wrapped so that it can travel in a pytree; modules are returned as they are."""
     return function if isinstance(function, eqx.Module) else Function(function)
+
+
+def plain_functions(part: Any) -> list[Function]:
+    """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
+    is_plain = lambda node: isinstance(node, Function)  # noqa: E731
+    return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
 
 
 def _listed(kind: str, parts: Any) -> tuple:
@@ -367,24 +327,4 @@ def _part(kind: str, part: Any, dtype: np.dtype) -> eqx.Module:
     return jax.tree.map(
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf,
         part if isinstance(part, eqx.Module) else Function(part),
-    )
-
-
-def _sum(terms: Any) -> Array:
-    total, *others = terms
-    for term in others:
-        total = total + term
-    return total
-
-
-def _shaped(force: Any, value: Any, state: Particles) -> Array:
-    """The force's value, if it is shaped like the velocity; seen once, while tracing."""
-    expected = state.velocity
-    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", type(value))
-    if shape == expected.shape and dtype == expected.dtype:
-        return value
-    name = getattr(getattr(force, "function", force), "__name__", type(force).__name__)
-    raise TypeError(
-        f"force {name}: got an array of shape {shape} and dtype {dtype}, expected {expected.shape} and {expected.dtype} "
-        "like the velocity. Build it from state and mass, and keep other numbers Python floats or fields of a module."
     )

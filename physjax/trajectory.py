@@ -49,8 +49,9 @@ class Trajectory(eqx.Module):
 
     @property
     def velocity(self) -> Float[Array | np.ndarray, "frames *lanes dim"]:
-        """Velocities [m/s] at the frames."""
-        return self._states().velocity
+        """Velocities [m/s] at the frames; of rigid bodies those of their centres of mass."""
+        states = self._states()
+        return states.velocity if hasattr(states, "velocity") else states.shown_to(None, self.scene.mass)[0].velocity
 
     @property
     def method(self) -> Any:
@@ -154,7 +155,7 @@ class Trajectory(eqx.Module):
             )
         return self.scene
 
-    def _states(self) -> Particles:
+    def _states(self) -> Any:
         if self.state is None:
             raise AttributeError(
                 "this trajectory holds .recorded only: simulate was told what to record instead of the state."

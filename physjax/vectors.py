@@ -117,3 +117,42 @@ def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"
     if amount.ndim == 0:
         return jnp.broadcast_to(amount * axis, like.shape)
     return scale(amount, jnp.broadcast_to(axis, like.shape))
+
+
+# quaternions (w, x, y, z); by lists of components, since XLA on CPU computes a vector anew for each reader of a component
+
+
+def composed(a: list, b: list) -> list:
+    """Hamilton's product ab of quaternions in components: the turn b, then the turn a."""
+    w, x, y, z = a
+    s, u, v, n = b
+    return [
+        w * s - x * u - y * v - z * n,
+        w * u + x * s + y * n - z * v,
+        w * v - x * n + y * s + z * u,
+        w * n + x * v - y * u + z * s,
+    ]
+
+
+def reverse(q: list) -> list:
+    """The turn back, in components: (w, -x, -y, -z)."""
+    w, x, y, z = q
+    return [w, -x, -y, -z]
+
+
+def turned(q: list, v: list) -> list:
+    """The vector v turned by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
+    w, x, y, z = q
+    a, b, c = v
+    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return [a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p]
+
+
+def turn(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    """The vector v turned by the unit quaternion q: from the body's frame to the world's, for an orientation q."""
+    return stacked(turned(components(q), components(v)))
+
+
+def turn_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    """The vector v turned back by the unit quaternion q: from the world's frame to the body's."""
+    return stacked(turned(reverse(components(q)), components(v)))

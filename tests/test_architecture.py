@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import physjax
-from physjax import Particles, Scene, forces, methods, simulate
+from physjax import Particles, Scene, forces, inertia, methods, rigid, simulate
 
 ROOT = Path(physjax.__file__).parent
 FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("*.py"))}
@@ -23,7 +23,7 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FIL
 
 FLOORS = (
     {"vectors", "checks", "files", "lanes", "loops"},
-    {"roots"},
+    {"roots", "particles"},
     {"scene"},
     {"crossing"},
     {"trajectory", "pins"},
@@ -225,6 +225,33 @@ def test_a_whole_run_adds_the_loop_and_the_frames_and_nothing_else():
     assert 0 < operations["while"] <= 2
     assert not {"gather", "scatter", "sqrt", "conditional"} & set(operations)
     assert not re.search(r"f32\[(\d+,)*3\]|f64\[", text)
+
+
+def test_particles_run_without_a_line_of_rigid_bodies():
+    program = """
+import sys
+import jax.numpy as jnp
+from physjax import Particles, Scene, energy, forces, methods, simulate
+scene = Scene(Particles(jnp.zeros(3), jnp.ones(3)), forces=(forces.Gravity(),))
+for method in methods.METHODS.values():
+    simulate(scene, method, dt=0.1, steps=4)
+energy.total(scene, 0.0, scene.state)
+print(*(name for name in sys.modules if name.startswith("physjax.physics.")))
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT.parent)
+    assert run.stdout.split()
+    assert not {"bodies", "inertia", "rigid"} & {name.rpartition(".")[2] for name in run.stdout.split()}
+
+
+def test_a_free_body_compiles_to_its_quaternion_and_nothing_of_pivots_or_torques():
+    brick = inertia.box(2.0, (1.0, 2.0, 3.0))
+    lanes = np.zeros((64, 3), np.float32)
+    with jax.enable_x64(False):
+        scene = Scene(rigid.bodies(brick, lanes, angular_velocity=(1.0, 2.0, 3.0)), brick, (forces.Gravity(),))
+        step = lambda scene, dt: scene.step(methods.rk4, 0.0, dt).state  # noqa: E731
+        _, operations, _ = compiled(step, scene, STEP)
+    assert not {"gather", "scatter", "sine", "cosine", "while", "reduce", "dot"} & set(operations)
+    assert operations["multiply"] < 4 * 60  # I⁻¹ Rᵀ L, half of q ω and a slope are 3 + 18 + 16 + 13 products a stage
 
 
 # import

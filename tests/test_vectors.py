@@ -5,7 +5,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax.vectors import components, cross, dot, norm, over, scale, spin, stacked, turn_left, unit, upward
+from physjax.vectors import (
+    components,
+    composed,
+    cross,
+    dot,
+    norm,
+    over,
+    reverse,
+    scale,
+    spin,
+    stacked,
+    turn,
+    turn_back,
+    turn_left,
+    turned,
+    unit,
+    upward,
+)
 
 # large and odd sizes, because jax 0.10.2 returned wrong rows for some of them on CPU (jax issue 39103)
 LANES = pytest.mark.parametrize("n", [1000, 16385, 32769, 50001])
@@ -14,7 +31,13 @@ LANES = pytest.mark.parametrize("n", [1000, 16385, 32769, 50001])
 @jax.jit
 def everything(a, b, flat, number, vector, amount):
     """Every helper at once, so that a size costs one compilation."""
+    p, q = ([number, *components(v)] for v in (a, b))
     return {
+        "composed": stacked(composed(p, q)),
+        "reverse": stacked(reverse(p)),
+        "turned": stacked(turned(p, components(b))),
+        "turn": turn(stacked(p), b),
+        "turn_back": turn_back(stacked(p), b),
         "dot": dot(a, b),
         "dot in the plane": dot(flat, turn_left(flat) + flat),
         "components": components(a)[1],
@@ -41,7 +64,18 @@ def expected(a, b, flat, number, vector, amount):
     products = (size(a, axis=-1) * size(b, axis=-1))[:, None]
     axis = np.zeros_like(a)
     axis[:, 2] = number
+    p, n = np.concatenate([number[:, None], a], axis=-1), number[:, None]
+    scalar = number * number - np.sum(a * b, axis=-1)
+    twist = np.concatenate([scalar[:, None], n * a + n * b + np.cross(a, b)], axis=-1)
+    bent, twice = np.cross(a, b), 2 * np.cross(a, np.cross(a, b))
+    far = ((1 + size(p, axis=-1)) ** 2 * size(b, axis=-1))[:, None]
+    around = (size(p, axis=-1) * np.hypot(number, size(b, axis=-1)))[:, None]
     return {
+        "composed": (twist, around),
+        "reverse": (p * [1, -1, -1, -1], 0.0),
+        "turned": (b + 2 * n * bent + twice, far),
+        "turn": (b + 2 * n * bent + twice, far),
+        "turn_back": (b - 2 * n * bent + twice, far),
         "dot": (np.sum(a * b, axis=-1), products[:, 0]),
         "components": (a[:, 1], 0.0),
         "stacked": (a, 0.0),
@@ -155,3 +189,15 @@ def test_a_vector_of_another_length_is_not_spread_over_the_components(shape):
 def test_an_axis_that_is_not_there_is_a_plain_error():
     with pytest.raises(ValueError, match=r"up: got axis 1, .* 1 components.*Give an axis from 0 to 0"):
         upward(jnp.asarray(9.8), 1, jnp.zeros((4, 1)))
+
+
+def test_quaternions_turn_as_matrices_do():
+    quarter = jnp.asarray([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # about z
+    np.testing.assert_allclose(turn(quarter, jnp.asarray([1.0, 0.0, 2.0])), [0.0, 1.0, 2.0], atol=1e-15)
+    rng = np.random.default_rng(4)
+    p, q = (unit(jnp.asarray(rng.normal(size=(9, 4)))) for _ in range(2))
+    v = jnp.asarray(rng.normal(size=(9, 3)))
+    both = stacked(composed(components(p), components(q)))
+    np.testing.assert_allclose(turn(both, v), turn(p, turn(q, v)), atol=1e-14)
+    np.testing.assert_allclose(turn_back(p, turn(p, v)), v, atol=1e-14)
+    np.testing.assert_allclose(norm(turn(p, v)), norm(v), rtol=1e-14)

@@ -1,4 +1,4 @@
-"""Runs as films in real time: cloth, springs, and particles with a trail behind them.
+"""Runs as films in real time: cloth, rigid bodies, springs, and particles with a trail behind them.
 
 Every function returns a `Film`, which shows itself in a notebook and has `.save("name.gif")` and `.save("name.html")`.
 It plays `speed` seconds of the run a second, in `fps` pictures, which are picked by the film's own time.
@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from physjax.checks import positive_integer, real_quantity
 from physjax.show.films import Film, schedule
 from physjax.show.panels import scenery_of
+from physjax.show.solids import taken_bodies
 from physjax.show.strands import colour_bar, lines, strands_of, take_springs
 from physjax.show.surfaces import surface
 from physjax.show.swarms import swarm_of, swarm_scenery
@@ -37,6 +38,21 @@ def cloth(
     who = "animate.cloth"
     faces, nodes = faces_of(who, sheet)
     seen = take(who, film, scene=scene, nodes=nodes, dims=(3,))
+    frames, fps = schedule(who, seen, fps, speed)
+    return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color))
+
+
+def bodies(
+    film: Trajectory,
+    shapes: Any,
+    *,
+    color: Any = "#56B4E9",
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
+) -> Film:
+    """Rigid bodies with their real shapes; see `plot.bodies`, and `animate.cloth` for the errors."""
+    who = "animate.bodies"
+    seen, faces = taken_bodies(who, film, shapes)
     frames, fps = schedule(who, seen, fps, speed)
     return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color))
 
@@ -82,4 +98,4 @@ def paths(
     return Film(scenery, frames, fps, draw, axes=axes)
 
 
-__all__ = ["Film", "cloth", "paths", "springs"]
+__all__ = ["Film", "bodies", "cloth", "paths", "springs"]

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.lanes import any_lane, wide
+from physjax.particles import demand_particles
 from physjax.scene import as_module
 from physjax.vectors import norm
 
@@ -127,6 +128,7 @@ class Adaptive(eqx.Module):
     def _error(self, start: Any, whole: Any, halves: Any, shape: tuple) -> Array:
         """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
         if self.error == "velocity":
+            demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
             worst = norm(halves.velocity - whole.velocity)
             return _worst(worst, shape) / self.atol.astype(worst.dtype)
         return _size(jax.tree.map(lambda a, b: a - b, halves, whole), self._tolerance(start, halves), shape)

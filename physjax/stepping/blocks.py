@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from physjax.lanes import is_per_lane
-from physjax.scene import Function, Scene
+from physjax.scene import Scene, plain_functions
 
 BLOCK = 8192
 """Lanes in a block: 200 kB of state in 3-D and float32, which leaves room for the stages of a step in a 1 MB cache."""
@@ -38,7 +38,7 @@ class Blocks(NamedTuple):
         cannot be cut, and those that share something that changes: `moving` are the arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)
-        whole = scene.couples or scene.led is not None or any(isinstance(force, Function) for force in scene.forces)
+        whole = scene.couples or scene.led is not None or bool(plain_functions(scene.forces))
         if whole or total < SMALLEST or frame_steps < FEWEST_STEPS or jax.default_backend() != "cpu":
             return None
         count = math.ceil(total / BLOCK)

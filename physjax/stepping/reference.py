@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.checks import real_quantity
-from physjax.scene import Particles, Scene
+from physjax.scene import Scene
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class _VectorField(eqx.Module):
 
     scene: Scene
 
-    def __call__(self, t: ArrayLike, y: Particles, args: Any) -> Particles:
+    def __call__(self, t: ArrayLike, y: Any, args: Any) -> Any:
         return self.scene.rate(t, y)
 
 
@@ -118,7 +118,7 @@ def in_dtype(scene: Scene, dtype: Any) -> Scene:
 @eqx.filter_jit
 def solve_ode(
     scene: Scene, times: Array, end: Array, rtol: Array, atol: Array, solver: Any, strict: bool
-) -> tuple[Particles, Array, dict]:
+) -> tuple[Any, Array, dict]:
     """diffrax's adaptive solve, forward only: states, success, statistics. Compiles once for all tolerances.
 
     With `strict` its steps are chosen by the largest component of the error and land on the times, so that no lane
@@ -146,10 +146,12 @@ def solve_ode(
         max_steps=MAX_STEPS if strict else MAX_STEPS // 10,
         throw=False,
     )
-    states = solution.ys if scene.led is None else jax.vmap(scene.led.lead)(times, solution.ys)
+    states = jax.vmap(scene.settled)(solution.ys)
+    if scene.led is not None:
+        states = jax.vmap(scene.led.lead)(times, states)
     return states, solution.result == diffrax.RESULTS.successful, solution.stats
 
 
-def _largest(state: Particles) -> Array:
+def _largest(state: Any) -> Array:
     """The largest component of a state: no lane may hide behind the others' average."""
     return jax.tree.reduce(jnp.maximum, jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf)), state))

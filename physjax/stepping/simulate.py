@@ -21,7 +21,7 @@ from jaxtyping import Array
 from physjax.checks import positive_integer, real_quantity
 from physjax.lanes import FEWEST, in_pieces
 from physjax.loops import repeat, time_at
-from physjax.scene import Function, Scene, as_module
+from physjax.scene import Scene, as_module, plain_functions
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
 
@@ -135,7 +135,7 @@ def _stands_alone(run: tuple) -> bool:
     scene, method, *_ = run
     path = () if scene.led is None else (scene.led.path,)
     parts = (*scene.forces, *scene.contacts, *path, method)
-    ours = all(_is_ours(part.function if isinstance(part, Function) else type(part)) for part in parts)
+    ours = all(map(_is_ours, (*map(type, parts), *(plain.function for plain in plain_functions(parts)))))
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
     return ours and not traced and jax.default_backend() == "cpu"
 

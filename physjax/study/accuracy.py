@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 
 from physjax.checks import real_quantity
 from physjax.physics import contacts
-from physjax.scene import Particles, Scene, as_module
+from physjax.scene import Scene, as_module
 from physjax.show.plot import PROJECTED
 from physjax.show.report import seconds_text
 from physjax.stepping.methods import METHODS, rk4
@@ -143,25 +143,26 @@ def _treatments(scene: Scene) -> dict[str, Scene]:
 class _Errors:
     """Errors of a run against the truth, relative to the extent of the path, the worst lane and moment."""
 
-    def __init__(self, problem: Problem, scene: Scene, truth: Particles):
-        away = np.sqrt(np.sum((truth.position - truth.position[0]) ** 2, axis=-1))
+    def __init__(self, problem: Problem, scene: Scene, truth: Any):
+        place = np.asarray(truth.place, float)
+        away = np.sqrt(np.sum((place - place[0]) ** 2, axis=-1))
         nodes = (0, -1) if scene.couples else (0,)
         extent = away.max(axis=nodes, keepdims=True)[0]
         self.extent = np.where(extent > 0, extent, 1.0)
-        self.truth = truth
+        self.place = place
         self.drift = jax.jit(partial(_drifts, quantities=problem.conserved))
         self.scene, self.times = scene, jnp.asarray(problem.times)
 
-    def __call__(self, states: Particles) -> tuple[float, float, tuple[float, ...]]:
+    def __call__(self, states: Any) -> tuple[float, float, tuple[float, ...]]:
         """Final error, path error, and the relative drift of each conserved quantity."""
-        off = np.asarray(states.position, float) - self.truth.position
+        off = np.asarray(states.place, float) - self.place
         with np.errstate(invalid="ignore", over="ignore"):
             error = np.sqrt(np.sum(off**2, axis=-1)) / self.extent
         drifts = tuple(float(d) for d in self.drift(self.scene, self.times, states))
         return float(error[-1].max()), float(error.max()), drifts
 
 
-def _drifts(scene: Scene, times: Any, states: Particles, quantities: tuple[Conserved, ...]) -> list:
+def _drifts(scene: Scene, times: Any, states: Any, quantities: tuple[Conserved, ...]) -> list:
     """Largest change of each conserved quantity over the path, relative to its size."""
     over_time = lambda f: jax.vmap(lambda t, state: f(scene, t, state))(times, states)  # noqa: E731
     drifts = []
@@ -172,7 +173,7 @@ def _drifts(scene: Scene, times: Any, states: Particles, quantities: tuple[Conse
     return drifts
 
 
-def _truth(problem: Problem) -> tuple[Particles, float, str]:
+def _truth(problem: Problem) -> tuple[Any, float, str]:
     """The true path in detail, the error it has itself (relative; 0 for a closed form), and where it comes from."""
     times = _detailed(problem)
     if problem.exact is not None:
@@ -184,20 +185,27 @@ def _truth(problem: Problem) -> tuple[Particles, float, str]:
     path = reference(problem.scene, times, **tolerance)
     # the same tolerance with longer steps, which need not land on the moments between: the difference is their error
     other = reference(problem.scene, problem.times, **tolerance)
-    extent = np.abs(path.position - path.position[0]).max()
-    floor = np.abs(path.position[::DETAIL] - other.position).max() / extent
-    return path.state, float(floor), "diffrax Dopri8, tolerance 1e-13"
+    floor = _apart(path.state, jax.tree.map(lambda leaf: leaf[::DETAIL], path.state), other.state)
+    return path.state, floor, "diffrax Dopri8, tolerance 1e-13"
 
 
-def _fine_path(problem: Problem) -> tuple[Particles, float, str]:
+def _fine_path(problem: Problem) -> tuple[Any, float, str]:
     """The path by rk4 with fine steps; its error is estimated by longer ones, which end at other moments."""
     scene, frames = in_dtype(problem.scene, jnp.float64), problem.frames * DETAIL
     run = lambda count: sample(scene, as_module(rk4), problem.duration / (frames * count), count, frames=frames)  # noqa: E731
     finer = LATE if _answers_late(scene) else 1
     path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(finer * count))) for count in (FINE, COARSER))
-    extent = np.abs(path.position - path.position[0]).max()
-    floor = np.abs(path.position - coarser.position).max() / extent
-    return path, float(floor), f"own rk4, step {seconds_text(problem.duration / (frames * finer * FINE))}"
+    return (
+        path,
+        _apart(path, path, coarser),
+        f"own rk4, step {seconds_text(problem.duration / (frames * finer * FINE))}",
+    )
+
+
+def _apart(path: Any, one: Any, other: Any) -> float:
+    """The largest difference of two paths, relative to the extent of one."""
+    place = np.asarray(path.place)
+    return float(np.abs(np.asarray(one.place) - other.place).max() / np.abs(place - place[0]).max())
 
 
 def _detailed(problem: Problem) -> np.ndarray:
@@ -300,8 +308,8 @@ def default_rivals() -> tuple:
 
 def _smallest_size(scene: Scene) -> float:
     """Typical size of the smaller of position and velocity: what an absolute tolerance is measured by."""
-    acceleration = np.asarray(_acceleration(scene, scene.state))
-    sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in (*scene.state, acceleration)]
+    leaves = jax.tree.leaves((scene.state, _driven(scene, scene.state)))
+    sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in leaves]
     return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
 
 
@@ -309,15 +317,15 @@ def _depends_on_velocity(scene: Scene) -> bool:
     """Whether the forces look at the velocity: the promise of some methods depends on it."""
     with jax.enable_x64(True):
         scene = in_dtype(scene, jnp.float64)
-        x, v = scene.state
-        push = jnp.asarray(np.random.default_rng(0).normal(size=v.shape)) * (1 + jnp.abs(v))
-        one, other = (_acceleration(scene, Particles(x, velocity)) for velocity in (v + push, v - push))
-        return bool(jnp.any(one != other))
+        rng = np.random.default_rng(0)
+        push = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * (1 + jnp.abs(leaf)), scene.state)
+        ends = (_driven(scene, scene.kick(scene.state, push, sign)) for sign in (1.0, -1.0))
+        return any(bool(jnp.any(a != b)) for a, b in zip(*map(jax.tree.leaves, ends), strict=True))
 
 
 @jax.jit  # one compilation instead of one for each operation
-def _acceleration(scene: Scene, state: Particles) -> Any:
-    return scene.acceleration(jnp.zeros((), state.dtype), state)
+def _driven(scene: Scene, state: Any) -> Any:
+    return state.driven(scene, jnp.zeros((), state.dtype))
 
 
 def _promised_order(method, velocity_dependent, scene):

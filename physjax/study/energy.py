@@ -1,14 +1,14 @@
 """Energy, momentum and angular momentum of a scene: what its physics keeps, and so what a method must not lose."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.scene import Particles, Scene
-from physjax.vectors import cross, dot, norm, scale
+from physjax.scene import Scene
+from physjax.vectors import cross, norm
 
 
 class Conserved(NamedTuple):
@@ -18,39 +18,45 @@ class Conserved(NamedTuple):
     """
 
     name: str
-    value: Callable[[Scene, ArrayLike, Particles], Array]
-    size: Callable[[Scene, ArrayLike, Particles], Array]
+    value: Callable[[Scene, ArrayLike, Any], Array]
+    size: Callable[[Scene, ArrayLike, Any], Array]
 
 
-def kinetic(scene: Scene, t: ArrayLike, state: Particles) -> Float[Array, "..."]:
-    """½mv² [J], per lane or summed over coupled ones."""
-    return _total(scene, 0.5 * scene.mass * dot(state.velocity, state.velocity))
+def kinetic(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+    """½mv² [J], of rigid bodies with ½ω·L, per lane or summed over coupled ones."""
+    return _total(scene, state.kinetic_energy(scene.mass))
 
 
-def potential(scene: Scene, t: ArrayLike, state: Particles) -> Float[Array, "..."]:
+def potential(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     """Potential energy of all forces that have one [J], per lane or summed over coupled ones."""
-    terms = [f.potential(t, state, scene.mass) for f in scene.forces if hasattr(f, "potential")]
+    see = lambda f: state.shown_to(f, scene.mass)  # noqa: E731
+    terms = [f.potential(t, *see(f)) for f in scene.forces if hasattr(f, "potential")]
     return _total(scene, sum(terms, jnp.zeros_like(state.position[..., 0])))
 
 
-def total(scene: Scene, t: ArrayLike, state: Particles) -> Float[Array, "..."]:
+def total(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     """Kinetic and potential energy [J], per lane or summed over coupled ones."""
     return kinetic(scene, t, state) + potential(scene, t, state)
 
 
-def momentum(scene: Scene, t: ArrayLike, state: Particles) -> Float[Array, "..."]:
+def momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     """Σmv [kg m/s], per lane or summed over coupled ones; the component last."""
-    p = scale(scene.mass, state.velocity)
+    p = state.linear_momentum(scene.mass)
     return jnp.sum(p, axis=-2) if scene.couples else p
 
 
-def angular_momentum(scene: Scene, t: ArrayLike, state: Particles) -> Float[Array, "..."]:
-    """Σ r × mv about the origin [kg m²/s]; a number in the plane, a vector in space."""
-    r, p = state.position, scale(scene.mass, state.velocity)
+def angular_momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+    """Σ r × mv about the origin [kg m²/s], of rigid bodies with their own; a number in the plane, a vector in space."""
+    r, p = state.position, state.linear_momentum(scene.mass)
     if r.shape[-1] == 2:
         return _total(scene, r[..., 0] * p[..., 1] - r[..., 1] * p[..., 0])
-    spin = cross(r, p)
+    spin = cross(r, p) + state.own_spin(scene.mass) if hasattr(state, "own_spin") else cross(r, p)
     return jnp.sum(spin, axis=-2) if scene.couples else spin
+
+
+def _arms(scene: Scene, state: Any) -> Array:
+    arms = norm(state.position) * norm(state.linear_momentum(scene.mass))
+    return arms + norm(state.own_spin(scene.mass)) if hasattr(state, "own_spin") else arms
 
 
 def _total(scene: Scene, per_lane: Array) -> Array:
@@ -59,11 +65,11 @@ def _total(scene: Scene, per_lane: Array) -> Array:
 
 ENERGY = Conserved("energy", total, kinetic)
 """Total energy, its errors measured by the kinetic energy."""
-MOMENTUM = Conserved("momentum", momentum, lambda scene, t, s: _total(scene, scene.mass * norm(s.velocity)))
+MOMENTUM = Conserved("momentum", momentum, lambda scene, t, s: _total(scene, norm(s.linear_momentum(scene.mass))))
 """Total momentum, its errors measured by Σm|v|."""
 ANGULAR_MOMENTUM = Conserved(
     "angular momentum",
     angular_momentum,
-    lambda scene, t, s: _total(scene, scene.mass * norm(s.position) * norm(s.velocity)),
+    lambda scene, t, s: _total(scene, _arms(scene, s)),
 )
-"""Angular momentum about the origin, its errors measured by Σm|r||v|."""
+"""Angular momentum about the origin, its errors measured by Σm|r||v|, and |L| of rigid bodies."""

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import positive_integer, real_quantity
-from physjax.scene import Particles, Scene
+from physjax.particles import Particles, demand_particles
+from physjax.scene import Scene
 from physjax.show.report import seconds_text
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.methods import METHODS
@@ -79,6 +80,7 @@ def explain(
         raise TypeError(
             "explain: expected a Trajectory that knows its scene and method, or a Scene with method and dt."
         )
+    demand_particles("explain", run.scene.state, "what turns is not linearised")
     scene, method, step = run.scene, run.method, float(np.min(np.asarray(run.dt)))
     real_quantity("dt [s]", step, above=0.0)
     first, node = _where(run)

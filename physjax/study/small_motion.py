@@ -15,7 +15,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.scene import Force, Particles, Scene
+from physjax.particles import Particles, demand_particles
+from physjax.scene import Force, Scene
 from physjax.stepping.reference import in_dtype
 
 DENSE = 300
@@ -77,6 +78,7 @@ def about(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
 
 def small_motion(scene: Scene, state: Particles) -> SmallMotion:
     """K and C of a scene about a state; held lanes do not move. Of large coupled scenes, their fastest modes."""
+    demand_particles("small motions", state, "what turns is not linearised")
     inside = scene.state.lanes[-1:] if scene.couples else ()
     size = int(np.prod(inside)) * state.position.shape[-1]
     if size <= DENSE:

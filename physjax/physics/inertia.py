@@ -1,0 +1,333 @@
+"""Inertia: mass, principal moments and axes of the usual solids, of points, of closed meshes, and of what is made of them.
+
+Closed forms may be traced: masses and sizes can be swept and differentiated. A full tensor is diagonalised once, on the
+host and in double precision.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+from numpy.linalg import eigh
+
+from physjax.checks import concrete, demand, real_quantity
+from physjax.physics.meshes import checked_mesh
+from physjax.vectors import components, dot, scale
+
+
+class Inertia(eqx.Module):
+    """Mass [kg] and principal moments about the centre of mass [kg m²] of rigid bodies: `mass=` of their scene.
+
+    `mass` is a scalar or per lane, `principal` `(3,)` or `(*lanes, 3)`, `axes` a quaternion from the principal axes to
+    the body's frame, None where they are the same. A line has no moment about itself and cannot spin about it. `about`
+    a point of itself, a body turns on a fixed pivot. Raises ValueError for numbers that no body has.
+    """
+
+    mass: Float[Array, "..."]
+    principal: Float[Array, "*lanes 3"]
+    axes: Float[Array, "*lanes 4"] | None
+    arm: Float[Array, "*lanes 3"] | None
+    pivot: Float[Array, "*lanes 3"] | None
+
+    def __init__(self, mass: Any, principal: Any, axes: Any = None):
+        self.mass = real_quantity("mass [kg]", mass, above=0.0)
+        self.principal = _real_moments(principal)
+        self.axes = None if axes is None else real_turn("axes", axes)
+        self.arm = self.pivot = None
+
+    @property
+    def inverse(self) -> Float[Array, "*lanes 3"]:
+        """1/I about each principal axis [1/(kg m²)]; zero where there is no moment."""
+        there = self.principal > 0
+        return jnp.where(there, 1 / jnp.where(there, self.principal, 1.0), 0.0)
+
+    @property
+    def tensor(self) -> np.ndarray:
+        """The full tensor in the body's frame [kg m²], `(*lanes, 3, 3)`, about the centre of mass or the pivot."""
+        (principal,) = _on_host("tensor", self.principal)
+        tensor = principal[..., None] * np.eye(3)
+        return tensor if self.axes is None else _turned(*_on_host("axes", self.axes), tensor)
+
+    def about(self, point: Any) -> "Inertia":
+        """The same body on a fixed pivot: a `point` [m] of it, in its frame, from its centre of mass.
+
+        The moments are then those about the pivot, by the parallel-axis theorem. The pivot is where that point is when
+        a scene starts, and there it stays. A point on a principal axis whose zeros can be seen, (0, 0, l), may be
+        traced; any other is worked out on the host.
+        """
+        if self.arm is not None:
+            raise ValueError("about: got an inertia with a pivot, expected one about the centre of mass.")
+        parts = _components("pivot [m]", point)
+        away = [i for i, part in enumerate(parts) if concrete(part) is None or np.any(concrete(part))]
+        point = jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
+        if self.axes is None and len(away) <= 1:
+            square = self.mass * dot(point, point)
+            more = [jnp.zeros_like(square) if [i] == away else square for i in range(3)]
+            body = Inertia(self.mass, sum(jnp.broadcast_arrays(self.principal, jnp.stack(more, axis=-1))))
+        else:
+            body = of_tensor(self.mass, self.tensor + _moved(*_on_host("pivot", self.mass, point)))
+        return eqx.tree_at(lambda body: body.arm, body, -point, is_leaf=lambda leaf: leaf is None)
+
+    def checked(self, lanes: tuple[int, ...], dtype: Any) -> "Inertia":
+        """The inertia of bodies in lanes of this shape, its numbers in this dtype; a ValueError where they do not fit."""
+        for name, width in (("mass", ()), ("principal", (3,)), ("axes", (4,)), ("arm", (3,))):
+            array = getattr(self, name)
+            if array is not None and array.shape not in (width, (*lanes, *width)):
+                raise ValueError(f"Inertia: got {name} of shape {array.shape}, expected {width} or {(*lanes, *width)}.")
+        numbers = [None if a is None else a.astype(dtype) for a in (self.mass, self.principal, self.axes, self.arm)]
+        return eqx.tree_at(
+            lambda i: (i.mass, i.principal, i.axes, i.arm), self, numbers, is_leaf=lambda leaf: leaf is None
+        )
+
+    def hung(self, pivot: Float[Array, "*lanes 3"]) -> "Inertia":
+        """The inertia with its pivot at a place of the world [m]."""
+        return eqx.tree_at(lambda i: i.pivot, self, pivot, is_leaf=lambda leaf: leaf is None)
+
+
+class Solid(NamedTuple):
+    """An inertia, and where the centre of mass is in the coordinates that were given [m]."""
+
+    inertia: Inertia
+    center: np.ndarray
+
+
+# closed forms
+
+
+def box(mass: ArrayLike, size: ArrayLike) -> Inertia:
+    """A box with edges a, b, c [m] along the axes: I = m/12 (b² + c², c² + a², a² + b²)."""
+    a, b, c = jnp.moveaxis(real_quantity("size [m]", size, above=0.0) ** 2, -1, 0)
+    return _of_shape(mass, 1 / 12, b + c, c + a, a + b)
+
+
+def sphere(mass: ArrayLike, radius: ArrayLike, *, hollow: bool = False) -> Inertia:
+    """A ball: I = 2/5 m r²; a thin shell: 2/3 m r²."""
+    square = real_quantity("radius [m]", radius, above=0.0) ** 2
+    return _of_shape(mass, 2 / 3 if hollow else 2 / 5, square, square, square)
+
+
+def cylinder(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
+    """A cylinder along an axis of its frame (2: z): I = m r²/2 about it, m (3r² + l²)/12 across."""
+    radius, length = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)
+    return _along(mass, axis, radius**2 / 2, (3 * radius**2 + length**2) / 12)
+
+
+def rod(mass: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
+    """A thin rod along an axis of its frame: I = m l²/12 across, none about itself."""
+    length = real_quantity("length [m]", length, above=0.0)
+    return _along(mass, axis, 0.0 * length, length**2 / 12)
+
+
+def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
+    """A cylinder of a `length` between its ends' hemispheres, of one density.
+
+    With their shares of the mass, s = 4r/(3l + 4r) and 1 - s: I = (1 - s) m r²/2 + s m 2r²/5 about the axis, (1 - s)
+    m (3r² + l²)/12 + s m (2r²/5 + l²/4 + 3lr/8) across.
+    """
+    r, l = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)  # noqa: E741
+    s = 4 * r / (3 * l + 4 * r)
+    about = (1 - s) * r**2 / 2 + s * 2 * r**2 / 5
+    across = (1 - s) * (3 * r**2 + l**2) / 12 + s * (2 * r**2 / 5 + l**2 / 4 + 3 * l * r / 8)
+    return _along(mass, axis, about, across)
+
+
+# by the full tensor
+
+
+def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
+    """The inertia of a full symmetric tensor in the body's frame [kg m²], `(3, 3)` or per lane; diagonalised on the host."""
+    (tensor,) = _on_host("tensor", tensor)
+    if tensor.shape[-2:] != (3, 3):
+        raise ValueError(f"tensor [kg m²]: got shape {tensor.shape}, expected (3, 3) or (*lanes, 3, 3).")
+    size = np.abs(tensor).max(axis=(-2, -1), keepdims=True)
+    rounding = 64 * np.finfo(float).eps * size
+    if not np.isfinite(tensor).all() or (np.abs(tensor - np.swapaxes(tensor, -2, -1)) > rounding).any():
+        raise ValueError(
+            f"tensor [kg m²]: got {tensor.tolist()}, expected finite numbers, symmetric about the diagonal."
+        )
+    if (np.abs(tensor * (1 - np.eye(3))) <= rounding).all():
+        return Inertia(mass, np.diagonal(tensor, axis1=-2, axis2=-1))
+    principal, columns = eigh(tensor)
+    right_handed = np.sign(np.sum(columns[..., 0] * np.cross(columns[..., 1], columns[..., 2]), axis=-1))
+    principal = np.where(np.abs(principal) <= rounding[..., 0], 0.0, principal)
+    return Inertia(mass, principal, _quaternion(columns * right_handed[..., None, None]))
+
+
+def points(masses: ArrayLike, positions: ArrayLike) -> Solid:
+    """Point masses [kg] `(n,)` held together at positions [m] `(n, 3)`: I = Σ m (|r|² 1 - r rᵀ)."""
+    masses, positions = _on_host("points", real_quantity("masses [kg]", masses, above=0.0), positions)
+    if positions.ndim != 2 or positions.shape != (masses.size, 3) or masses.ndim != 1:
+        raise ValueError(
+            f"points: got masses {masses.shape} and positions {positions.shape}, expected (n,) and (n, 3)."
+        )
+    center = np.sum(masses[:, None] * positions, axis=0) / masses.sum()
+    return Solid(of_tensor(masses.sum(), _moved(masses, positions - center).sum(axis=0)), center)
+
+
+def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float | None = None) -> Solid:
+    """What a closed surface of triangles encloses, by the divergence theorem; give its mass [kg] or density [kg/m³].
+
+    Exact for the polyhedron: a sum over the tetrahedra between each face and a point. `meshes.read_mesh` reads
+    vertices [m] and faces from a file. Raises ValueError for a mesh that is open, or whose faces do not turn alike.
+    """
+    if (mass is None) == (density is None):
+        raise ValueError("mesh: expected either mass= [kg] or density= [kg/m³].")
+    vertices, faces = checked_mesh(vertices, faces)
+    _demand_closed(faces)
+    middle = vertices.mean(axis=0)
+    a, b, c = (vertices[faces[:, i]] - middle for i in range(3))
+    volume = np.sum(a * np.cross(b, c), axis=-1) / 6
+    whole = volume.sum()
+    if abs(whole) <= 1e-12 * np.abs(volume).sum():
+        raise ValueError(f"mesh: encloses a volume of {whole:g} m³, expected a body.")
+    edges = np.stack([a, b, c, a + b + c])
+    center = np.sum(volume[:, None] * edges[3], axis=0) / (4 * whole)
+    second = np.sum(volume[:, None, None] / 20 * np.sum(edges[..., :, None] * edges[..., None, :], axis=0), axis=0)
+    mass = abs(whole) * density if mass is None else mass
+    (heavy,) = _on_host("mass", real_quantity("mass [kg]", mass, above=0.0))
+    second = heavy * (second / whole - center[:, None] * center)
+    return Solid(of_tensor(heavy, np.trace(second) * np.eye(3) - second), middle + center)
+
+
+def composite(parts: Any) -> Solid:
+    """Bodies held together: `(inertia, position)` or `(inertia, position, orientation)` for each, by the parallel-axis theorem.
+
+    Positions [m] of the centres of mass and orientations (quaternions) are in the frame of the whole.
+    """
+    parts = [(*part, (1.0, 0.0, 0.0, 0.0))[:3] for part in parts]
+    if not parts or any(not isinstance(body, Inertia) or body.arm is not None for body, _, _ in parts):
+        raise ValueError("composite: expected (inertia, position) or (inertia, position, orientation) for each part.")
+    masses, positions = _on_host(
+        "composite", [float(body.mass) for body, _, _ in parts], [place for _, place, _ in parts]
+    )
+    center = np.sum(masses[:, None] * positions, axis=0) / masses.sum()
+    whole = _moved(masses, positions - center).sum(axis=0)
+    for body, _, orientation in parts:
+        (q,) = _on_host("orientation", real_turn("orientation", orientation))
+        whole = whole + _turned(q, body.tensor)
+    return Solid(of_tensor(masses.sum(), whole), center)
+
+
+# the checks, and the host's part
+
+
+def real_turn(name: str, value: Any) -> Float[Array, "*lanes 4"]:
+    """A quaternion (w, x, y, z) brought to length 1; a ValueError for zero, which turns nothing anywhere."""
+    q = real_quantity(name, value)
+    if q.shape[-1:] != (4,):
+        raise ValueError(f"{name}: got shape {q.shape}, expected a quaternion (w, x, y, z), (4,) or (*lanes, 4).")
+    if concrete(q) is not None:
+        demand(
+            name, q, np.any(concrete(q) != 0, axis=-1, keepdims=True) | np.zeros(q.shape, bool), "a quaternion not zero"
+        )
+    return scale(1 / jnp.sqrt(dot(q, q)), q)
+
+
+def _components(name: str, vector: Any) -> list[Array]:
+    """The components of a vector one by one; written as a tuple of three, each may be traced or not."""
+    if isinstance(vector, list | tuple) and not isinstance(vector[0], list | tuple):
+        parts = [real_quantity(name, part) for part in vector]
+    else:
+        parts = components(real_quantity(name, vector))
+    if len(parts) != 3:
+        raise ValueError(f"{name}: got {len(parts)} components, expected 3.")
+    return parts
+
+
+def _real_moments(value: Any) -> Float[Array, "*lanes 3"]:
+    """Principal moments that a body can have: none negative, none greater than the sum of the others."""
+    principal = real_quantity("principal moments [kg m²]", value, at_least=0.0)
+    if principal.shape[-1:] != (3,):
+        raise ValueError(f"principal moments [kg m²]: got shape {principal.shape}, expected (3,) or (*lanes, 3).")
+    values = concrete(principal)
+    if values is not None:
+        rounding = 1 + 64 * np.finfo(values.dtype).eps
+        good = (2 * values.max(axis=-1) <= rounding * values.sum(axis=-1)) & (values.max(axis=-1) > 0)
+        if not good.all():
+            raise ValueError(
+                f"principal moments [kg m²]: got {values[~good].reshape(-1, 3)[0].tolist()}, expected none greater than "
+                "the sum of the other two (the triangle inequality), and not all zero: no body has such moments."
+            )
+    return principal
+
+
+def _of_shape(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
+    mass = real_quantity("mass [kg]", mass, above=0.0)
+    return Inertia(
+        mass,
+        scale(factor * mass, jnp.stack(moments, axis=-1))
+        if mass.ndim == 0
+        else jnp.stack([factor * mass * m for m in moments], axis=-1),
+    )
+
+
+def _along(mass: ArrayLike, axis: int, about: Array, across: Array) -> Inertia:
+    """Moments for a kilogram about an axis of the body and across it."""
+    if axis not in (0, 1, 2):
+        raise ValueError(
+            f"axis: got {axis!r}, expected 0, 1 or 2: the axis of the body's frame that the shape is along."
+        )
+    return _of_shape(mass, 1.0, *(about if i == axis else across for i in range(3)))
+
+
+def _on_host(name: str, *values: Any) -> list[np.ndarray]:
+    """The values in double precision; a TypeError where one is being traced."""
+    arrays = [concrete(value) for value in values]
+    if any(array is None for array in arrays):
+        raise TypeError(
+            f"{name}: is being traced, but a full tensor is diagonalised before compiling. Build it outside, or give "
+            "principal moments and axes."
+        )
+    return [array.astype(float) for array in arrays]
+
+
+def _moved(mass: np.ndarray, away: np.ndarray) -> np.ndarray:
+    """m (|d|² 1 - d dᵀ): what a mass adds that is `away` from the axes."""
+    square = np.sum(away * away, axis=-1)[..., None, None] * np.eye(3)
+    return mass[..., None, None] * (square - away[..., :, None] * away[..., None, :])
+
+
+def _turned(q: np.ndarray, tensor: np.ndarray) -> np.ndarray:
+    """R T Rᵀ: a tensor of a frame that the unit quaternion q turns, as seen from outside."""
+    matrix = _matrix(q)
+    half = np.sum(matrix[..., :, :, None] * tensor[..., None, :, :], axis=-2)
+    return np.sum(half[..., :, None, :] * matrix[..., None, :, :], axis=-1)
+
+
+def _matrix(q: np.ndarray) -> np.ndarray:
+    """The rotation matrix of a unit quaternion."""
+    w, (x, y, z) = q[..., 0], np.moveaxis(q[..., 1:], -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _quaternion(matrix: np.ndarray) -> np.ndarray:
+    """The unit quaternion of a rotation matrix: an eigenvector, which is accurate for every angle (I. Bar-Itzhack 2000)."""
+    trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
+    odd = matrix - np.swapaxes(matrix, -2, -1)
+    first = np.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], axis=-1)
+    lower = matrix + np.swapaxes(matrix, -2, -1) - trace * np.eye(3)
+    top = np.concatenate([trace, first[..., None, :]], axis=-1)
+    return eigh(np.concatenate([top, np.concatenate([first[..., None], lower], axis=-1)], axis=-2))[1][..., -1]
+
+
+def _demand_closed(faces: np.ndarray) -> None:
+    """Raise a ValueError unless each edge of a face is run through backwards by exactly one other."""
+    sides = np.concatenate([faces[:, [i, (i + 1) % 3]] for i in range(3)])
+    found, counts = np.unique(sides, axis=0, return_counts=True)
+    backwards = {tuple(side[::-1]) for side in found.tolist()}
+    bad = [
+        side for side, count in zip(found.tolist(), counts, strict=True) if count > 1 or tuple(side) not in backwards
+    ]
+    if bad:
+        raise ValueError(
+            f"mesh: {len(bad)} of {len(found)} edges, first that from vertex {bad[0][0]} to {bad[0][1]}, have no face on "
+            "the other side that turns the same way; expected a closed surface. Close it, or turn its faces alike."
+        )

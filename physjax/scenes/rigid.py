@@ -1,0 +1,202 @@
+"""Things that turn: tops, a handle that flips, a pendulum with a body."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from physjax.physics import forces, inertia, rigid
+from physjax.scene import Scene
+from physjax.scenes.gallery import scene
+from physjax.study.energy import ANGULAR_MOMENTUM, ENERGY
+from physjax.study.problem import Problem, Truth
+from physjax.trajectory import Trajectory
+from physjax.vectors import composed, turn, turn_back, turned
+
+UP, OWN = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+@scene
+def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
+    """A disc thrown with a wobble, free of torque: its axis goes round the angular momentum, and ω round its axis.
+
+    Seen from the world the axis goes round at |L|/I₁, seen from the disc ω does at (I₃ - I₁)ω₃/I₁.
+    """
+    mass, velocity = 0.2, np.array([2.0, 3.0, 0.0])
+    disc = inertia.cylinder(mass, radius=0.1, length=0.02)
+    i1, _, i3 = np.asarray(disc.principal, float)
+    momentum = np.array([i1 * wobble, 0.0, i3 * spin])
+    size = np.linalg.norm(momentum)
+    slip = (i3 - i1) * spin / i1
+    thrown = Scene(rigid.bodies(disc, velocity=velocity, angular_velocity=(wobble, 0.0, spin)), disc)
+
+    def exact(t):
+        q = composed(_about(momentum / size, size / i1 * t), _about(OWN, -slip * t))
+        path = np.multiply.outer(t, velocity)
+        kept = (np.broadcast_to(a, path.shape) for a in (mass * velocity, momentum))
+        return rigid.RigidBodies(path, np.stack(q, axis=-1), *kept)
+
+    return Problem(
+        thrown,
+        duration=2 * np.pi / slip,
+        exact=exact,
+        conserved=(ENERGY, ANGULAR_MOMENTUM),
+        truths=(
+            Truth(
+                "seen from the disc, ω goes round at (I₃ - I₁)ω₃/I₁ [relative]",
+                lambda flight: _rate(_seen(flight)[..., :2], flight.time) / slip,
+                1.0,
+                1e-8,
+            ),
+        ),
+        frames=64,
+    )
+
+
+@scene
+def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: float = 9.8) -> Problem:
+    """Two tops that lean on their tips and go round at a steady pace, slow and fast: the two roots for one spin.
+
+    Ω = [I₃ω₃ ± √(I₃²ω₃² - 4I₁mgl cosθ)]/(2I₁cosθ), I₁ about the tip; there is no nutation at exactly these.
+    """
+    mass = 0.2
+    top = inertia.cylinder(mass, radius=0.06, length=0.02).about((0.0, 0.0, -length))
+    i1, _, i3 = np.asarray(top.principal, float)
+    root = np.sqrt((i3 * spin) ** 2 - 4 * i1 * mass * g * length * np.cos(tilt))
+    pace = (i3 * spin + np.array([-1.0, 1.0]) * root) / (2 * i1 * np.cos(tilt))
+    own = spin - pace * np.cos(tilt)
+    axis = np.array([np.sin(tilt), np.cos(tilt), 0.0])
+    start = _leaning(tilt)
+    omega = np.outer(pace, UP) + np.outer(own, axis)
+    place = length * axis + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.4]])
+    tops = Scene(rigid.bodies(top, place, np.stack(start), angular_velocity=omega), top, (forces.Gravity(g),))
+
+    def exact(t):
+        round_about = _about(UP, np.multiply.outer(t, pace))
+        q = composed(composed(round_about, start), _about(OWN, np.multiply.outer(t, own)))
+        arm = np.stack(turned(round_about, list(length * axis)), axis=-1)
+        momentum = mass * np.cross(np.outer(pace, UP), arm)
+        first = np.outer(i3 * spin * np.ones(2), axis) + i1 * (omega - spin * axis)
+        spins = np.stack(turned(round_about, list(first.T)), axis=-1)
+        return rigid.RigidBodies(arm + place - length * axis, np.stack(q, axis=-1), momentum, spins)
+
+    return Problem(
+        tops,
+        duration=float(2 * np.pi / pace[0]),
+        exact=exact,
+        conserved=(ENERGY,),
+        truths=(
+            Truth(
+                "goes round at Ω of the steady precession [relative]",
+                lambda flight: _rate(_axis(flight)[..., [2, 0]], flight.time) / pace,
+                1.0,
+                1e-7,
+            ),
+            Truth("leans as it did [1]", lambda flight: _axis(flight)[..., 1], np.cos(tilt), 1e-7),
+        ),
+        frames=256,
+    )
+
+
+@scene
+def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
+    """A T-shaped handle spun about its axis of intermediate moment, in space: it turns over, and back, for ever.
+
+    Its angular velocity seen from itself has the period 4K(k)/√((I₃ - I₂)(L² - 2EI₁)/(I₁I₂I₃)), I₁ < I₂ < I₃ and k² =
+    (I₂ - I₁)(2EI₃ - L²)/((I₃ - I₂)(L² - 2EI₁)), where L² > 2EI₂ (Landau and Lifshitz, Mechanics, section 37).
+    """
+    bar, grip = inertia.cylinder(0.15, 0.01, 0.2, axis=0), inertia.cylinder(0.1, 0.01, 0.1, axis=1)
+    handle = inertia.composite([(bar, (0.0, 0.0, 0.0)), (grip, (0.0, -0.06, 0.0))]).inertia
+    order = np.argsort(np.asarray(handle.principal))
+    i1, i2, i3 = np.asarray(handle.principal, float)[order]
+    omega = np.zeros(3)
+    omega[order] = 0.0, spin, nudge
+    twice, square = i2 * spin**2 + i3 * nudge**2, (i2 * spin) ** 2 + (i3 * nudge) ** 2
+    above = (i3 - i2) * (square - twice * i1)
+    k = np.sqrt((i2 - i1) * (twice * i3 - square) / above)
+    period = 4 * complete_elliptic(k) / np.sqrt(above / (i1 * i2 * i3))
+    spun = Scene(rigid.bodies(handle, angular_velocity=omega, frame="body"), handle)
+    size = np.linalg.norm(np.asarray(spun.state.angular_momentum))
+    return Problem(
+        spun,
+        duration=float(period),
+        conserved=(ENERGY, ANGULAR_MOMENTUM),
+        truths=(
+            Truth(
+                "has turned over after half of the period, and back after all of it [rad/s]",
+                lambda flight: _seen(flight)[[32, 64]][:, order[1]],
+                np.array([-spin, spin]),
+                1e-6 * spin,
+            ),
+            Truth(
+                "keeps |L| [relative]",
+                lambda flight: np.linalg.norm(flight.state.angular_momentum, axis=-1) / size,
+                1.0,
+                1e-12,
+            ),
+        ),
+        frames=64,
+    )
+
+
+@scene
+def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.8) -> Problem:
+    """A plank that swings from one end, far out: its period is 4K(sin θ₀/2)√(I/mgl), I about the pivot."""
+    mass, arm = 1.5, 0.45 * length
+    plank = inertia.box(mass, (0.08, length, 0.02)).about((0.0, arm, 0.0))
+    swing = np.sqrt(float(plank.principal[2]) / (mass * g * arm))
+    period = 4 * complete_elliptic(np.sin(amplitude / 2)) * swing
+    place = arm * np.array([np.sin(amplitude), -np.cos(amplitude), 0.0])
+    start = np.stack(_about((0.0, 0.0, 1.0), amplitude))
+    return Problem(
+        Scene(rigid.bodies(plank, place, start), plank, (forces.Gravity(g),)),
+        duration=float(period),
+        conserved=(ENERGY,),
+        truths=(
+            Truth(
+                "is lowest after a quarter of the period and after three [m]",
+                lambda flight: flight.position[[16, 48], 0],
+                0.0,
+                1e-6 * arm,
+            ),
+            Truth("is back after all of it [m]", lambda flight: flight.position[-1], place, 1e-6 * arm),
+        ),
+        frames=64,
+    )
+
+
+def complete_elliptic(k: float) -> float:
+    """K(k) = ∫₀^(π/2) dφ/√(1 - k² sin² φ), by the arithmetic-geometric mean."""
+    a, b = 1.0, np.sqrt(1 - k * k)
+    for _ in range(8):  # digits double each time
+        a, b = (a + b) / 2, np.sqrt(a * b)
+    return np.pi / (2 * a)
+
+
+def _about(axis, angle):
+    """The quaternion of a turn about a unit vector, in components."""
+    half = np.asarray(angle) / 2
+    return [np.cos(half), *(part * np.sin(half) for part in axis)]
+
+
+def _leaning(tilt: float) -> list:
+    """The quaternion that brings the body's z axis from the world's to the tilt from up, towards x, in components."""
+    return composed(_about((0.0, 0.0, 1.0), -tilt), _about((1.0, 0.0, 0.0), -np.pi / 2))
+
+
+def _axis(flight: Trajectory) -> np.ndarray:
+    """Where the body's z axis points, at every frame."""
+    q = jnp.asarray(flight.state.orientation)
+    return np.asarray(turn(q, jnp.broadcast_to(jnp.asarray(OWN, q.dtype), (*q.shape[:-1], 3))))
+
+
+def _seen(flight: Trajectory) -> np.ndarray:
+    """The angular velocity seen from the body, at every frame [rad/s]."""
+    states = jax.tree.map(jnp.asarray, flight.state)
+    omega = jax.vmap(lambda state: rigid.angular_velocity(state, flight.scene.mass))(states)
+    return np.asarray(turn_back(states.orientation, omega))
+
+
+def _rate(plane: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """How fast the angle of vectors of a plane grows [rad/s], frames along the first axis."""
+    angle = np.unwrap(np.arctan2(plane[..., 1], plane[..., 0]), axis=0)
+    return (angle[-1] - angle[0]) / time[-1]

@@ -1,0 +1,127 @@
+"""Rigid bodies with their real shapes: triangles that are fixed to each body and turn with it."""
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from physjax.checks import real_quantity
+from physjax.physics.meshes import checked_mesh
+from physjax.show.panels import panels, scenery_of
+from physjax.show.surfaces import surface
+from physjax.show.takes import Take, picked, take_lanes
+from physjax.trajectory import Trajectory
+
+ROUND = 24
+"""Corners of what is drawn for a circle."""
+_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_CUBE_FACES = np.array(
+    [
+        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
+        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
+    ]
+)
+
+
+class Shape(NamedTuple):
+    """What a body looks like in its own frame, from its centre of mass: vertices [m] `(n, 3)`, triangles `(m, 3)`."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+    def at(self, place: Any) -> "Shape":
+        """The shape moved by a vector [m] of the body."""
+        return self._replace(vertices=self.vertices + np.asarray(place, float))
+
+    def joined(self, *others: "Shape") -> "Shape":
+        """One shape of several."""
+        vertices, faces = zip(self, *others, strict=True)
+        starts = np.cumsum([0, *(len(part) for part in vertices[:-1])])
+        return Shape(np.concatenate(vertices), np.concatenate([f + s for f, s in zip(faces, starts, strict=True)]))
+
+
+def box(size: Any) -> Shape:
+    """A box with edges along the axes [m], `(3,)`."""
+    return Shape(_CUBE * np.asarray(real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
+
+
+def cylinder(radius: float, length: float, *, axis: int = 2) -> Shape:
+    """A cylinder along an axis of the body (2: z), radius and length [m]."""
+    return _turned_outline(
+        [(0.0, -0.5 * length), (radius, -0.5 * length), (radius, 0.5 * length), (0.0, 0.5 * length)], axis
+    )
+
+
+def capsule(radius: float, length: float, *, axis: int = 2) -> Shape:
+    """A cylinder of a `length` between two hemispheres [m]."""
+    angle = np.linspace(0, np.pi / 2, ROUND // 4 + 1)
+    cap = np.stack([radius * np.sin(angle), 0.5 * length + radius * np.cos(angle)], axis=1)
+    return _turned_outline([*(cap * [1, -1]), *cap[::-1]], axis)
+
+
+def sphere(radius: float) -> Shape:
+    """A ball [m]."""
+    return capsule(radius, 0.0)
+
+
+def bodies(
+    film: Trajectory,
+    shapes: Any,
+    frames: int | Iterable[int] | None = None,
+    *,
+    color: Any = "#56B4E9",
+    figure: Any = None,
+) -> Any:
+    """Draw rigid bodies at chosen frames, side by side, each as its shape, shaded by Lambert's law.
+
+    `shapes` is a `Shape` for all bodies or one for each: `solids.box`, `cylinder`, `capsule`, `sphere`, or
+    `Shape(*meshes.read_mesh(file)).at(-center)`. For the rest see `plot.cloth`. Returns the figure.
+    """
+    who = "plot.bodies"
+    seen, faces = taken_bodies(who, film, shapes)
+    chosen = picked(who, seen, frames)
+    return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color), figure)
+
+
+def taken_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray]:
+    """The frames of a run with the vertices of all shapes in place of the bodies, and the triangles between them."""
+    seen = take_lanes(who, film, dims=(3,))
+    if not hasattr(film.state, "orientation"):
+        raise TypeError(
+            f"{who}: got a film of {type(film.state).__name__}, expected RigidBodies. plot.paths draws others."
+        )
+    lanes = seen.position.shape[1]
+    shapes = [shapes] * lanes if isinstance(shapes, Shape) else list(shapes)
+    if len(shapes) != lanes or not all(isinstance(shape, Shape) for shape in shapes):
+        raise ValueError(f"{who}: got {len(shapes)} shapes, expected a Shape for all {lanes} bodies or one for each.")
+    shapes = [Shape(*checked_mesh(*shape, name=f"{who}: shape {i}")) for i, shape in enumerate(shapes)]
+    q = np.asarray(film.state.orientation, float).reshape(len(seen.time), lanes, 4)
+    corners = [
+        seen.position[:, i, None] + _turned(q[:, i, None], shape.vertices[None]) for i, shape in enumerate(shapes)
+    ]
+    whole = shapes[0].joined(*shapes[1:])
+    return seen._replace(position=np.concatenate(corners, axis=1)), whole.faces
+
+
+def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    twice = 2 * np.cross(q[..., 1:], v)
+    return v + q[..., :1] * twice + np.cross(q[..., 1:], twice)
+
+
+def _turned_outline(outline: Any, axis: int) -> Shape:
+    """The body that an outline (distance from the axis, place on it) leaves when it goes round the axis."""
+    angle = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
+    rings = [np.stack([r * np.cos(angle), r * np.sin(angle), np.full(ROUND, z)], axis=1) for r, z in outline]
+    here, there = np.arange(ROUND), np.roll(np.arange(ROUND), -1)
+    faces = []
+    for start in range(0, ROUND * (len(outline) - 1), ROUND):
+        low, high = start, start + ROUND
+        faces += [
+            np.stack([low + here, low + there, high + there], 1),
+            np.stack([low + here, high + there, high + here], 1),
+        ]
+    vertices, faces = np.roll(np.concatenate(rings), axis - 2, axis=1), np.concatenate(faces)
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    seen = np.abs(np.cross(b - a, c - a)).max(axis=1) > 1e-12 * np.abs(vertices).max() ** 2  # at the poles half are not
+    return Shape(vertices, faces[seen])
