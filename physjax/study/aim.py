@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, demand, positive_integer, real_quantity
+from physjax.particles import demand_particles
 from physjax.physics.impact import impact
 from physjax.scene import Particles, Scene, as_module
 from physjax.stepping.methods import rk4
@@ -260,6 +261,7 @@ def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Ran
     if not callable(method):
         raise TypeError(f"aim_at: got the method {method!r}, expected a method of stepping, e.g. methods.rk4.")
     steps = positive_integer("steps", steps)
+    demand_particles("aim_at", scene.state, "a launch is a position and a velocity")
     if scene.pinned is not None:
         raise ValueError("aim_at: got a scene with pinned lanes, expected a launch velocity that is free. Unpin them.")
     if scene.couples:
