@@ -11,6 +11,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
+from physjax.study.solve import solve
 
 
 class Fit(NamedTuple):
@@ -58,13 +59,13 @@ def fit(predict: Callable, guess: Any, observed: Any, *, sigma: Any = None, max_
     if sigma is not None:
         weight = weight / _noise(sigma, seen)
 
-    def residual(z, _=None):
+    def residual(z):
         predicted = ravel_pytree(predict(unravel(start + unit * z)))[0]
         # what was not observed counts for nothing, in the derivative as well
         return jnp.where(present, predicted - jnp.where(present, data, 0.0), 0.0) * weight
 
     unit = jnp.where(start == 0, 1.0, jnp.abs(start))
-    z, converged, steps = _least_squares(residual, jnp.zeros_like(start), max_steps)
+    z, _, converged, steps = solve(residual, jnp.zeros_like(start), max_steps=max_steps)
     # the prediction and its derivative at once, since compiling a simulation is what a single fit costs
     left, jacobian = jax.vmap(lambda way: jax.jvp(residual, (z,), (way,)), out_axes=(None, 1))(
         jnp.eye(start.size, dtype=start.dtype)
@@ -84,16 +85,6 @@ def fit(predict: Callable, guess: Any, observed: Any, *, sigma: Any = None, max_
         steps,
         covariance,
     )
-
-
-def _least_squares(residual: Callable, start: Array, max_steps: int) -> tuple[Array, Array, Array]:
-    """Where Σr² is least, whether the search converged, and its steps."""
-    import optimistix
-
-    small = float(jnp.finfo(start.dtype).eps) ** 0.5
-    solver = optimistix.LevenbergMarquardt(rtol=small, atol=small)
-    end = optimistix.least_squares(residual, solver, start, max_steps=max_steps, throw=False)
-    return end.value, end.result == optimistix.RESULTS.successful, jnp.asarray(end.stats["num_steps"], jnp.int32)
 
 
 def _covariance(jacobian: Array, variance: Array, unit: Array) -> tuple[Array, Array]:
