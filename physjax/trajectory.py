@@ -84,6 +84,17 @@ class Trajectory(eqx.Module):
         """The scene with frames along a leading axis in each array that changed: its state, and what parts remember."""
         return _remembering(self._known_scene("film"), self._states(), self.parts)
 
+    def __repr__(self) -> str:
+        """One line: what was run, for how long, and whether it held."""
+        method = self.method
+        how = "" if method is None else f"{getattr(method, '__name__', type(method).__name__)}, "
+        if concrete(self.time) is None or np.ndim(self.first_step):
+            return f"<Trajectory: {how}{self.steps} steps, traced or out of vmap>"
+        time, ok = np.asarray(self.time), np.asarray(self.ok)
+        shape = "recorded" if self.state is None else f"position {self.position.shape} {self.position.dtype}"
+        held = "ok" if ok.all() else f"{ok.size - ok.sum()} of {ok.size} blew up"
+        return f"<Trajectory: {how}{len(time)} frames from t = {time.min():g} to {time.max():g} s, {shape}, {held}>"
+
     def crossing(self, surface: Any, *, direction: int | None = None) -> Crossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 

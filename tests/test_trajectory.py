@@ -145,6 +145,17 @@ def overdue(t, state, mass):
     return jnp.where(state.position < t, jnp.inf, 0.0)
 
 
+def test_a_run_tells_itself_in_one_line():
+    flight = simulate(rockets(push=jnp.array([5.0, jnp.nan, 5.0])), methods.rk4, dt=DT, steps=10)
+    told = "11 frames from t = 0 to 0.1 s, position (11, 3, 2) float64, 1 of 3 blew up"
+    assert repr(flight) == f"<Trajectory: rk4, {told}>"
+    assert "10 steps" in repr(
+        jax.vmap(lambda push: simulate(rockets(push=push), methods.rk4, dt=DT, steps=10))(jnp.ones(2))
+    )
+    times = np.linspace(0.0, 0.1, 3)
+    assert repr(reference(Scene(Particles(jnp.zeros(2), jnp.ones(2))), times)).startswith("<Trajectory: 3 frames")
+
+
 def test_the_watch_for_a_failure_counts_time_as_the_run_did():
     x = jnp.asarray([[0.75], [1.35], [9.0]])
     run = simulate(Scene(Particles(x, 0.0 * x), forces=(overdue,)), methods.euler, dt=0.1, steps=10, first_step=5)
