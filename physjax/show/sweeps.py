@@ -99,6 +99,8 @@ def _panels(axes: list, number: np.ndarray, bad: np.ndarray, what: str, figure: 
 
 def _cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float) -> Any:
     """Cells coloured by the number, with a few lines of equal number."""
+    from matplotlib.ticker import MaxNLocator
+
     (up, y), (right, x) = axes
     keep = tuple(slice(None, None, math.ceil(v.size / FINEST)) for v in (y, x))
     y, x, number = y[keep[0]], x[keep[1]], number[keep]
@@ -106,9 +108,14 @@ def _cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float) -> 
     mesh = ax.pcolormesh(x, y, np.ma.masked_invalid(number), vmin=low, vmax=high, shading="nearest", rasterized=True)
     if min(number.shape) > 2 and low < high:
         lines = ax.contour(
-            x, y, np.ma.masked_invalid(number), levels=np.linspace(low, high, 9)[1:-1], colors="white", linewidths=0.7
+            x,
+            y,
+            np.ma.masked_invalid(number),
+            levels=MaxNLocator(8).tick_values(low, high),
+            colors="white",
+            linewidths=0.7,
         )
-        ax.clabel(lines, fontsize=8, fmt="%.3g")
+        ax.clabel(lines, fontsize=8, fmt="%.4g")
     ax.set(xlabel=right, ylabel=up, xscale=_scale(x), yscale=_scale(y))
     return mesh
 

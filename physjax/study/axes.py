@@ -131,8 +131,9 @@ def _stacked(name: str, values: list) -> Any:
             or not eqx.tree_equal(static, rest)
         ):
             raise ValueError(
-                f"axis {name}: the values 0 and {place} have different parts, {_short(values[0])} and {_short(values[place])}. "
-                "A sweep is one compiled program for all lanes: expected records of one structure that differ in numbers only."
+                f"axis {name}: the values 0 and {place} differ in more than numbers: in their parts, in how many nodes or "
+                "springs they have, or in a function. A sweep is one compiled program for all lanes: expected records that "
+                "differ in numbers only. Sweep scenes of each shape on their own."
             )
         for (path, one), other in zip(
             jax.tree_util.tree_leaves_with_path(first), jax.tree.leaves(numbers), strict=True
@@ -147,11 +148,6 @@ def _stacked(name: str, values: list) -> Any:
         lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *(numbers for numbers, _ in parts)
     )
     return eqx.combine(stacked, rest)
-
-
-def _short(value: Any) -> str:
-    text = repr(jax.tree.structure(value))
-    return text if len(text) <= 120 else text[:117] + "..."
 
 
 def latin_hypercube(ranges: Mapping[str, tuple[float, float]], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
