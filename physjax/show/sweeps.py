@@ -67,7 +67,9 @@ def _line(axis: tuple, number: np.ndarray, bad: np.ndarray, what: str, ax: Any) 
 def _map(axes: list, number: np.ndarray, bad: np.ndarray, what: str, ax: Any) -> Any:
     """The first axis upwards, the second to the right, a colour bar."""
     ax = _axes(ax)
-    mesh = _cells(ax, axes, number, *_span(number))
+    mesh, lines = _cells(ax, axes, number, *_span(number))
+    if lines is not None:
+        ax.clabel(lines, fontsize=8, fmt="%.4g")
     ax.figure.colorbar(mesh, ax=ax, label=what)
     if bad.any():
         ax.set_title(f"grey: failed ({bad.sum()} of {bad.size})", fontsize=10, color="0.3")
@@ -86,7 +88,7 @@ def _panels(axes: list, number: np.ndarray, bad: np.ndarray, what: str, figure: 
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     span = _span(number[shown])
     for ax, i in zip(panels, shown, strict=False):
-        mesh = _cells(ax, others, number[i], *span)
+        mesh, _ = _cells(ax, others, number[i], *span)
         ax.set_title(f"{name}: {values[i]:.4g}", fontsize=10)
     for ax in panels:
         ax.label_outer()
@@ -97,8 +99,8 @@ def _panels(axes: list, number: np.ndarray, bad: np.ndarray, what: str, figure: 
     return figure
 
 
-def _cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float) -> Any:
-    """Cells coloured by the number, with a few lines of equal number."""
+def _cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float) -> tuple[Any, Any]:
+    """Cells coloured by the number, with a few lines of equal number (None where there are too few cells)."""
     from matplotlib.ticker import MaxNLocator
 
     (up, y), (right, x) = axes
@@ -106,18 +108,12 @@ def _cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float) -> 
     y, x, number = y[keep[0]], x[keep[1]], number[keep]
     ax.set_facecolor(GREY)
     mesh = ax.pcolormesh(x, y, np.ma.masked_invalid(number), vmin=low, vmax=high, shading="nearest", rasterized=True)
+    lines = None
     if min(number.shape) > 2 and low < high:
-        lines = ax.contour(
-            x,
-            y,
-            np.ma.masked_invalid(number),
-            levels=MaxNLocator(8).tick_values(low, high),
-            colors="white",
-            linewidths=0.7,
-        )
-        ax.clabel(lines, fontsize=8, fmt="%.4g")
+        levels = MaxNLocator(8).tick_values(low, high)
+        lines = ax.contour(x, y, np.ma.masked_invalid(number), levels=levels, colors="white", linewidths=0.7)
     ax.set(xlabel=right, ylabel=up, xscale=_scale(x), yscale=_scale(y))
-    return mesh
+    return mesh, lines
 
 
 def _points(axes: list, number: np.ndarray, bad: np.ndarray, what: str, ax: Any) -> Any:

@@ -1,6 +1,6 @@
-"""A measure as one compiled program over many lanes: traced once, judged lane by lane, run in blocks that fit a cache.
+"""A measure as one compiled program over many lanes: traced once, judged lane by lane, run in blocks.
 
-A block is a `vmap` over a few thousand lanes; a batch is some blocks one after the other, on every device its share.
+A block is a `vmap` over so many lanes as fit a cache; a batch is some blocks one after the other, on every device its share.
 """
 
 import functools
@@ -135,14 +135,17 @@ def layout(
     if begun is not None and batch in (None, begun[0]):
         batch, size = begun
     else:
-        share = math.ceil(min(lanes, batch or lanes) / devices)
-        fitting = min(CARRIED // program.carried, memory // (2 * devices * program.peak), BLOCK)
+        share = math.ceil(min(lanes, batch or lanes) / len(devices))
+        # a CPU is fastest in its cache, anything else with all that it can hold
+        best = min(CARRIED // program.carried, BLOCK) if devices[0].platform == "cpu" else LARGEST
+        fitting = min(best, memory // (2 * len(devices) * program.peak))
         size = min(share, 1 << max(0, fitting.bit_length() - 1))
-        left = memory - devices * size * program.peak
+        left = memory - len(devices) * size * program.peak
         most = max(size, min(LARGEST, left // (2 * program.passed)) // size * size)
         # batches of equal length in whole blocks
         batch = batch or math.ceil(lanes / math.ceil(lanes / most) / size) * size
-    return Layout(batch, size, math.ceil(math.ceil(batch / size) / devices) * devices)
+        size = math.ceil(batch / math.ceil(batch / size))
+    return Layout(batch, size, math.ceil(math.ceil(batch / size) / len(devices)) * len(devices))
 
 
 @functools.lru_cache(maxsize=16)

@@ -91,7 +91,7 @@ def sweep(
         chunks.writable_folder(out)
     begun = None if out is None else chunks.begun(out)
     program = traced(measure, _shapes(lanes))
-    cut = layout(program, lanes.count, positive_integer("memory [bytes]", memory), len(devices), batch, begun)
+    cut = layout(program, lanes.count, positive_integer("memory [bytes]", memory), devices, batch, begun)
     manifest = _manifest(lanes, program, cut)
     rebuild = jax.tree.structure(program.values).unflatten
     with nullcontext() if out is None else chunks.opened(out, manifest, (i, n), _coordinates(lanes)) as folder:

@@ -29,7 +29,7 @@ class Best(NamedTuple):
     score: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sweep:
     """The results of a sweep. `axes` are the swept values by name; `shape` is that of the results, an axis each.
 

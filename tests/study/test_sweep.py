@@ -108,7 +108,7 @@ def test_memory_decides_the_size_of_batches_and_bounds_what_xla_takes():
     point = {name: jax.ShapeDtypeStruct((), np.float64) for name in ("speed", "angle")}
     program = lanewise.traced(film, point)
     for memory in (1 << 20, 1 << 24):
-        cut = lanewise.layout(program, 10**6, memory, 1)
+        cut = lanewise.layout(program, 10**6, memory, jax.local_devices()[:1])
         one = jax.vmap(jax.extend.core.jaxpr_as_fun(program.jaxpr))
         shape = jax.ShapeDtypeStruct((cut.count, cut.size), np.float64)
         needs = (
