@@ -118,7 +118,7 @@ def layout(
     program: Traced,
     lanes: int,
     memory: int,
-    devices: int,
+    devices: Sequence[Any],
     batch: int | None = None,
     begun: tuple[int, int] | None = None,
 ) -> Layout:

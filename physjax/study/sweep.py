@@ -64,8 +64,8 @@ def sweep(
     The measure takes one number for each axis and returns a pytree of arrays. An axis may also be a record of arrays (a
     NamedTuple, of which the measure gets one of numbers) or a list of records of the same shape, such as scenes. Sampled
     points come from `sweep.latin_hypercube` and `sweep.sobol`, to be zipped. A lane is bad where a result's own `ok`
-    says so (a `Trajectory`, `solve`, a `crossing`, a dict with "ok") or where a number is not finite; it never changes
-    another lane.
+    says so (a `Trajectory`, `solve`, a `crossing`, a dict with "ok") or where a number is not finite; it changes no bit of
+    another lane (contacts alone compute a step in other roundings while any lane of a block lies at rest on them).
 
     Lanes are computed `batch` at a time, by default as many as fit `memory` [bytes], in one compiled program on all local
     `devices`. With `out`, each batch is a file in that folder as soon as it is done, and the same call goes on where a
