@@ -135,30 +135,35 @@ def matched(fly: Any, truth: np.ndarray, allowed: float) -> tuple[float, float]:
     return next((one for one in tried if one[1] <= allowed), min(tried, key=lambda one: one[1]))
 
 
-def alone(task: str, *, points: int, devices: int, cores: int) -> float:
-    """The result of `--task` in a process with so many devices and cores."""
-    mine = sorted(os.sched_getaffinity(0))
-    every = mine + [core for core in range(os.cpu_count()) if core not in mine]
-    given = {"points": points, "devices": devices, "cores": every[:cores]}
+def alone(task: str, *, points: int, devices: int, repeats: int) -> list[float]:
+    """The numbers of a `--task` in a process of its own."""
+    given = {"points": points, "devices": devices, "repeats": repeats}
     command = [sys.executable, __file__, "--task", task, json.dumps(given)]
     run = subprocess.run(command, check=True, capture_output=True, text=True)
-    return float(run.stdout.split()[-1])
+    return [float(number) for number in run.stdout.split()]
 
 
-def seconds(points: int) -> float:
-    """The least time of some sweeps on all devices [s]."""
-    swept(points)
-    return min(harness.stopwatch(partial(swept, points)) for _ in range(5))
+def seconds(points: int, repeats: int) -> tuple[float, ...]:
+    """The least times of a sweep on one device on one core, and on two devices on two cores, taken in turn [s]."""
+    mine = sorted(os.sched_getaffinity(0))
+    cores = [*mine, *(core for core in range(os.cpu_count()) if core not in mine)]
+    taken = {1: [], 2: []}
+    for _ in range(1 + repeats):  # the first pays for the compilations
+        for count, times in taken.items():
+            for thread in os.listdir("/proc/self/task"):
+                os.sched_setaffinity(int(thread), cores[:count])
+            times.append(harness.stopwatch(partial(swept, points, devices=jax.local_devices()[:count])))
+    return tuple(min(times[1:]) for times in taken.values())
 
 
-def memory(points: int) -> float:
+def memory(points: int, repeats: int) -> tuple[float]:
     """Memory that a sweep into a folder takes at its highest, its compilation included [bytes]."""
     with tempfile.TemporaryDirectory() as folder:
         sweep(place, axes(10), progress=False, out=Path(folder) / "first")  # what any sweep loads
         Path("/proc/self/clear_refs").write_text("5")  # forget the highest so far
         before = _status("VmRSS")
         sweep(apex, axes(points), progress=False, memory=BUDGET, out=Path(folder) / "measured")
-        return _status("VmHWM") - before
+        return (_status("VmHWM") - before,)
 
 
 def _status(field: str) -> float:
@@ -217,9 +222,8 @@ def main() -> None:
     ]
     bare, rate, kept = (row["rate"] for row in rows[:3])
     tell("memory, two devices")
-    taken = alone("memory", points=size.points, devices=1, cores=1)
-    turns = range(1 if quick else 3)
-    one, two = (min(alone("seconds", points=size.points, devices=n, cores=n) for _ in turns) for n in (1, 2))
+    (taken,) = alone("memory", points=size.points, devices=1, repeats=1)
+    one, two = alone("seconds", points=size.points, devices=2, repeats=4 * size.repeats)
     bars = [
         Bar("sweep: share of the rate of the bare run", rate / bare, ">=", 0.7),
         Bar("sweep into a folder: share of the rate of the bare run", kept / bare, ">=", 0.7),
@@ -261,8 +265,7 @@ def main() -> None:
 if __name__ == "__main__":
     if "--task" in sys.argv:
         given = json.loads(sys.argv[3])
-        os.sched_setaffinity(0, given["cores"])
-        jax.config.update("jax_num_cpu_devices", given["devices"])
-        print({"seconds": seconds, "memory": memory}[sys.argv[2]](given["points"]))
+        jax.config.update("jax_num_cpu_devices", given.pop("devices"))
+        print(*{"seconds": seconds, "memory": memory}[sys.argv[2]](**given))
     else:
         main()

@@ -40,12 +40,23 @@ class Axis(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """A hash of name, structure, dtypes, shapes and bytes."""
-        found = hashlib.sha256(self.name.encode())
-        for path, leaf in jax.tree_util.tree_leaves_with_path(self.values):
-            found.update(f"{jax.tree_util.keystr(path)} {leaf.dtype} {leaf.shape}".encode())
-            found.update(np.ascontiguousarray(leaf).tobytes())
+        """A hash of names, dtypes, shapes and bytes, the same for a record and for the dict that comes back from a file."""
+        found = hashlib.sha256()
+        for name, array in sorted(self.arrays.items()):
+            found.update(f"{name} {array.dtype} {array.shape}".encode())
+            found.update(np.ascontiguousarray(array).tobytes())
         return found.hexdigest()
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays by name, `axis.<name>` and where in the record."""
+        leaves = jax.tree_util.tree_leaves_with_path(self.values)
+        return {".".join(filter(None, ("axis", self.name, leaf_name(path)))): leaf for path, leaf in leaves}
+
+
+def leaf_name(path: tuple) -> str:
+    """The path of a leaf as a name with dots."""
+    return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 class Lanes(NamedTuple):
@@ -64,6 +75,11 @@ class Lanes(NamedTuple):
     def count(self) -> int:
         """How many points there are."""
         return math.prod(self.shape)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of all axes by name."""
+        return {name: array for axis in self.axes for name, array in axis.arrays.items()}
 
     def indices(self, lanes: Any) -> tuple:
         """The place on each axis of lanes given by their number."""

@@ -21,6 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from physjax.stepping.blocks import BLOCK
 from physjax.stepping.simulate import WIDE
+from physjax.study.axes import leaf_name
 from physjax.trajectory import Trajectory
 
 CARRIED = 64 * BLOCK
@@ -205,11 +206,6 @@ def _ok(node: Any) -> Any:
 
 def _at(path: tuple) -> str:
     return f" (at {leaf_name(path)})" if path else ""
-
-
-def leaf_name(path: tuple) -> str:
-    """The path of a leaf as a name with dots."""
-    return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def _digest(jaxpr: ClosedJaxpr, leaves: list) -> str:

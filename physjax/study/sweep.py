@@ -39,7 +39,7 @@ from physjax.study import chunks
 from physjax.study.axes import Lanes, checked_lanes, latin_hypercube, sobol
 from physjax.study.chunks import InMemory, Store
 from physjax.study.lanewise import Layout, Traced, compiled, layout, traced
-from physjax.study.swept import Sweep, axis_arrays, load, value_names
+from physjax.study.swept import Sweep, load, value_names
 
 __all__ = ["latin_hypercube", "load", "sobol", "sweep"]
 
@@ -94,7 +94,7 @@ def sweep(
     cut = layout(program, lanes.count, positive_integer("memory [bytes]", memory), devices, batch, begun)
     manifest = _manifest(lanes, program, cut)
     rebuild = jax.tree.structure(program.values).unflatten
-    with nullcontext() if out is None else chunks.opened(out, manifest, (i, n), _coordinates(lanes)) as folder:
+    with nullcontext() if out is None else chunks.opened(out, manifest, (i, n), lanes.arrays) as folder:
         store = InMemory(manifest) if folder is None else folder
         _compute(store, lanes, program, cut, devices, (i, n), progress)
     if jax.process_count() > 1 and shard is None:
@@ -157,10 +157,6 @@ def _shapes(lanes: Lanes) -> dict[str, Any]:
     """A point of the design as shapes and dtypes."""
     one = lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype)  # noqa: E731
     return {axis.name: jax.tree.map(one, axis.values) for axis in lanes.axes}
-
-
-def _coordinates(lanes: Lanes) -> dict[str, np.ndarray]:
-    return {name: array for axis in lanes.axes for name, array in axis_arrays(axis).items()}
 
 
 def _checked_devices(devices: Sequence[Any] | None) -> tuple:

@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,8 +14,7 @@ import numpy as np
 
 from physjax.files import replacing
 from physjax.study import chunks
-from physjax.study.axes import Axis, Lanes
-from physjax.study.lanewise import leaf_name
+from physjax.study.axes import Axis, Lanes, leaf_name
 
 MISSING = "not computed yet"
 """Status -1: lanes of chunks that are not there."""
@@ -34,7 +34,8 @@ class Sweep:
     """The results of a sweep. `axes` are the swept values by name; `shape` is that of the results, an axis each.
 
     `values` is what the measure returned, every array with `shape` in front; from a file or folder a dict by name, or the
-    array itself where it is one. `status` is 0 where a lane is good; otherwise `reasons[status]` says what went wrong there.
+    array itself where it is one. `status` is 0 where a lane is good; otherwise `reasons[status]` says what went wrong there;
+    -1 is a lane that is not computed yet, whose values are zeros.
     Results that lie in a folder are read when first asked for.
     """
 
@@ -126,8 +127,7 @@ class Sweep:
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """Everything by name: `axis.<name>`, `value...`, `status`, and `reasons`."""
-        coordinates = {name: array for axis in self.lanes.axes for name, array in axis_arrays(axis).items()}
-        return coordinates | self.arrays | {"status": self.status, "reasons": np.array(self.reasons)}
+        return self.lanes.arrays | self.arrays | {"status": self.status, "reasons": np.array(self.reasons)}
 
     def to_xarray(self) -> Any:
         """An `xarray.Dataset` with named dimensions and coordinates. Needs xarray."""
@@ -159,18 +159,11 @@ def load(path: str | os.PathLike) -> Sweep:
     path = Path(path)
     if path.is_dir():
         folder = chunks.found(path)
-        with np.load(path / "axes.npz") as archive:
-            lanes = _lanes(dict(archive), folder.manifest["design"])
+        lanes = _lanes(_read(path / "axes.npz"), folder.manifest["design"])
+        if {axis.name: axis.digest for axis in lanes.axes} != folder.manifest["axes"]:
+            raise ValueError(f"load: {path / 'axes.npz'} does not hold the axes of this sweep. Use another folder.")
         return Sweep(lanes, tuple(folder.manifest["reasons"]), folder.gathered)
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"load: there is no file {path}. Expected one written by Sweep.save, or a sweep's folder."
-        )
-    try:
-        with np.load(path) as archive:
-            arrays = dict(archive)
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"load: {path} is damaged or not an .npz file ({error}).") from error
+    arrays = _read(path)
     missing = {"status", "reasons", "design"} - set(arrays)
     if missing:
         raise ValueError(f"load: {path} is not a saved sweep: it lacks {', '.join(sorted(missing))}.")
@@ -180,10 +173,16 @@ def load(path: str | os.PathLike) -> Sweep:
     return Sweep(lanes, tuple(map(str, arrays["reasons"])), lambda: flat)
 
 
-def axis_arrays(axis: Axis) -> dict[str, np.ndarray]:
-    """The arrays of an axis by name, `axis.<name>` and where in the record."""
-    found = jax.tree_util.tree_leaves_with_path(axis.values)
-    return {".".join(filter(None, ("axis", axis.name, leaf_name(path)))): leaf for path, leaf in found}
+def _read(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"load: there is no file {path}. Expected one written by Sweep.save, or a sweep's folder."
+        )
+    try:
+        with np.load(path) as archive:
+            return dict(archive)
+    except (ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"load: {path} is damaged or not an .npz file ({error}).") from error
 
 
 def value_names(values: Any) -> list[str]:

@@ -73,10 +73,11 @@ class Launch(NamedTuple):
     angle: object
 
 
-def test_records_of_numbers_and_lists_of_scenes_are_axes():
+def test_records_of_numbers_and_lists_of_scenes_are_axes(tmp_path):
     pairs = Launch(SPEED[:5], ANGLE)
     expected = quiet(landing, {"speed": SPEED[:5], "angle": ANGLE}, design="zip").values
-    by_record = quiet(lambda shot: landing(*shot), {"shot": pairs})
+    by_record = quiet(lambda shot: landing(*shot), {"shot": pairs}, out=tmp_path)
+    np.testing.assert_array_equal(sweep.load(tmp_path).axes["shot"]["angle"], ANGLE)
     scenes = [ball(*pair) for pair in zip(*pairs, strict=True)]
     fly = lambda scene: simulate(scene, methods.rk4, dt=0.02, steps=50, save_every=50).position[-1, 0]  # noqa: E731
     by_scene = quiet(fly, {"scene": scenes})

@@ -185,6 +185,16 @@ def test_a_manifest_that_was_changed_is_refused(tmp_path):
         quiet(product, AXES, out=tmp_path)
 
 
+def test_axes_that_are_not_those_of_the_folder_are_refused(tmp_path):
+    quiet(product, AXES, batch=100, out=tmp_path)
+    np.savez(tmp_path / "axes.npz", **{"axis.x": AXES["x"], "axis.y": AXES["y"][::-1]})
+    with pytest.raises(ValueError, match=r"axes.npz does not hold the axes of this sweep"):
+        sweep.load(tmp_path)
+    (tmp_path / "axes.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"axes.npz is damaged"):
+        sweep.load(tmp_path)
+
+
 def test_a_folder_in_use_is_refused_unless_both_share(tmp_path):
     quiet(product, AXES, batch=100, out=tmp_path, shard=(0, 2))
     manifest = chunks.found(tmp_path).manifest
