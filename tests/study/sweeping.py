@@ -18,12 +18,12 @@ def thrown(speed, angle):
     return jnp.where(speed > 39.0, jnp.nan, end)
 
 
-def run(kept=None, *, devices=1, address=None, process=0, **options):
-    """Sweep, and write the results into a file."""
+def run(outs, *, devices=1, address=None, process=0, **options):
+    """Sweep into each folder, or into memory where it is None, and write the results into the file named by it."""
     jax.config.update("jax_num_cpu_devices", devices)
     jax.config.update("jax_enable_x64", True)
     if address is not None:
         jax.distributed.initialize(address, num_processes=2, process_id=process)
-    found = sweep(thrown, AXES, progress=False, **options)
-    if kept is not None:
+    for kept, out in outs.items():
+        found = sweep(thrown, AXES, progress=False, out=out, **options)
         np.savez(kept, value=found.values, status=found.status)

@@ -21,9 +21,9 @@ PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(["physjax.study.sweep"])
 
 
-def start(**options):
-    """A sweep in a process of its own."""
-    process = PROCESSES.Process(target=sweeping.run, kwargs={"batch": BATCH} | options)
+def start(outs, **options):
+    """Sweeps in a process of its own, into the folders (None: memory) by the files of their results."""
+    process = PROCESSES.Process(target=sweeping.run, args=(outs,), kwargs={"batch": BATCH} | options)
     process.start()
     return process
 
@@ -44,7 +44,7 @@ def same(one, other):
 def uninterrupted(tmp_path_factory):
     """The results of one process and one device."""
     kept = tmp_path_factory.mktemp("one") / "kept.npz"
-    done(start(kept=str(kept)))
+    done(start({kept: None}))
     return kept
 
 
@@ -66,7 +66,7 @@ def test_killed_at_ten_random_moments_and_resumed_it_is_bit_equal_and_nothing_is
 ):
     out, kept, before, rng = tmp_path / "out", tmp_path / "kept.npz", set(), random.Random()
     for _ in range(10):
-        process = start(out=str(out))
+        process = start({kept: out})
         until = time.monotonic() + 60
         while len(files(out)) <= len(before) and process.is_alive() and time.monotonic() < until:
             time.sleep(0.02)
@@ -77,7 +77,7 @@ def test_killed_at_ten_random_moments_and_resumed_it_is_bit_equal_and_nothing_is
         assert before < after, "a finished chunk was written again, or none was added"
         before = after
     assert len(before) < 225, "the kills came too late to mean anything"
-    done(start(out=str(out), kept=str(kept)))
+    done(start({kept: out}))
     assert before < files(out)
     assert len(files(out)) == 225
     assert not list(out.glob(".chunk-*")), "half a chunk was left behind"
@@ -86,19 +86,17 @@ def test_killed_at_ten_random_moments_and_resumed_it_is_bit_equal_and_nothing_is
 
 def test_two_devices_give_the_bits_of_one(tmp_path, uninterrupted):
     # two blocks of the same size in a batch, one on each
-    done(start(devices=2, batch=2 * BATCH, kept=str(tmp_path / "kept.npz")))
+    done(start({tmp_path / "kept.npz": None}, devices=2, batch=2 * BATCH))
     same(tmp_path / "kept.npz", uninterrupted)
 
 
-@pytest.mark.parametrize("where", ["memory", "folder"])
-def test_two_processes_give_the_bits_of_one(tmp_path, uninterrupted, where):
+def test_two_processes_give_the_bits_of_one_in_memory_and_in_a_folder(tmp_path, uninterrupted):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    out = {"out": str(tmp_path / "out")} if where == "folder" else {}
-    kept = [tmp_path / f"{i}.npz" for i in (0, 1)]
-    done(*(start(address=address, process=i, kept=str(kept[i]), **out) for i in (0, 1)))
-    for one in kept:
+    outs = [{tmp_path / f"memory{i}.npz": None, tmp_path / f"folder{i}.npz": tmp_path / "out"} for i in (0, 1)]
+    done(*(start(outs[i], address=address, process=i) for i in (0, 1)))
+    for one in (*outs[0], *outs[1]):
         same(one, uninterrupted)
 
 
