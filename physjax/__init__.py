@@ -8,7 +8,7 @@ from physjax.pins import Pins
 from physjax.scene import Contact, Field, Force, Particles, Scene, loads
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
-from physjax.stepping.simulate import simulate
+from physjax.stepping.simulate import simulate, state_after
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from physjax.study.aim import aim_at
     from physjax.study.fit import fit
     from physjax.study.solve import minimise, solve
+    from physjax.study.sweep import sweep
 
 __all__ = [
     "Contact",
@@ -55,6 +56,8 @@ __all__ = [
     "solve",
     "springs",
     "stability",
+    "state_after",
+    "sweep",
 ]
 __version__ = "0.1.0"
 
@@ -79,6 +82,7 @@ _LATER = {
     "solve": "physjax.study.solve:solve",
     "springs": "physjax.physics.springs",
     "stability": "physjax.study.stability",
+    "sweep": "physjax.study.sweep:sweep",
 }
 
 

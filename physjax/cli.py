@@ -52,6 +52,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     aim.add_argument("--out", default="aim", metavar="DIR", help="where the picture goes (default: aim)")
     aim.set_defaults(run=_aim)
 
+    sweep = commands.add_parser("sweep", help="an outcome of a scene over a grid of the numbers that it is built from")
+    sweep.add_argument("scene", metavar="SCENE", help="a name from `physjax scenes`")
+    sweep.add_argument(
+        "--over",
+        nargs="+",
+        required=True,
+        metavar="NAME=LOW:HIGH:COUNT",
+        help="arguments of the scene, e.g. speed=10:50:40",
+    )
+    sweep.add_argument("--outcome", required=True, metavar="NAME", help="height, distance, speed or energy")
+    sweep.add_argument("--method", default="rk4", metavar="NAME", help="a method of stepping (default: rk4)")
+    sweep.add_argument("--steps", type=int, default=1024, help="steps of each run (default: 1024)")
+    sweep.add_argument(
+        "--out", default="sweep", metavar="DIR", help="where chunks, sweep.npz and the picture go (default: sweep)"
+    )
+    sweep.set_defaults(run=_sweep)
+
     options = parser.parse_args(arguments)
     try:
         options.run(options)
@@ -222,6 +239,51 @@ def _thrown(options: argparse.Namespace):
     if options.drag is not None:
         loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
     return Scene(Particles(start, [0.0] * dim), mass=options.mass, forces=tuple(loads))
+
+
+def _sweep(options: argparse.Namespace) -> None:
+    """Print the best points and what failed; write the results, resumably, and their picture."""
+    import jax
+    import matplotlib
+
+    from physjax.checks import known
+    from physjax.files import replacing, writable_folder
+    from physjax.scenes import SCENES
+    from physjax.stepping.methods import METHODS
+    from physjax.study.outcomes import OUTCOMES, swept_scene
+
+    build, outcome = SCENES[known("scene", options.scene, SCENES)], known("outcome", options.outcome, OUTCOMES)
+    method = METHODS[known("method", options.method, METHODS)]
+    axes = dict(_range(text) for text in options.over)
+    folder = writable_folder(options.out)
+    matplotlib.use("Agg")
+    with jax.enable_x64(True):
+        found = swept_scene(build, axes, outcome, method=method, steps=options.steps, out=folder / "chunks")
+        words = OUTCOMES[outcome].__doc__.strip().rstrip(".")
+        if found.ok.any():
+            for name, largest in (("least", False), ("most", True)):
+                best = found.best(outcome, largest=largest)
+                where = ", ".join(f"{axis} = {float(best.point[axis]):.6g}" for axis in axes)
+                print(f"{name}: {best.score:.6g} at {where}")
+        for reason, count in found.failures.items():
+            print(f"{count} of {found.status.size} lanes failed: {reason}")
+        found.save(folder / "sweep.npz")
+        drawn = found.plot(outcome, labels={outcome: words})
+        with replacing(folder / "sweep.png", "wb") as file:
+            (drawn if hasattr(drawn, "savefig") else drawn.figure).savefig(file, dpi=125)
+    print(f"{words}: {folder / 'sweep.npz'}, {folder / 'sweep.png'}")
+
+
+def _range(text: str) -> tuple[str, Any]:
+    """An axis from NAME=LOW:HIGH:COUNT."""
+    import numpy as np
+
+    name, _, numbers = text.partition("=")
+    try:
+        low, high, count = numbers.split(":")
+        return name, np.linspace(float(low), float(high), int(count))
+    except ValueError as error:
+        raise ValueError(f"--over: got {text!r}, expected NAME=LOW:HIGH:COUNT, e.g. speed=10:50:40.") from error
 
 
 def _study(name: str, folder: Path, quick: bool):

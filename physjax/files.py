@@ -9,9 +9,10 @@ from typing import IO
 
 
 @contextmanager
-def replacing(path: str | os.PathLike, mode: str = "w") -> Iterator[IO]:
+def replacing(path: str | os.PathLike, mode: str = "w", *, durable: bool = False) -> Iterator[IO]:
     """Open a temporary file that takes the place of `path` when the block ends well, and vanishes when it does not.
 
+    A `durable` one is on the disk, with its name, before this returns: it outlives a machine that loses its power.
     Raises FileNotFoundError when the folder of `path` does not exist.
     """
     path = Path(path)
@@ -22,8 +23,13 @@ def replacing(path: str | os.PathLike, mode: str = "w") -> Iterator[IO]:
     try:
         with os.fdopen(handle, mode, **text) as file:
             yield file
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
+        if durable:
+            _sync_folder(path.parent)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
@@ -39,6 +45,16 @@ def writable_folder(path: str | os.PathLike) -> Path:
     except OSError as error:
         raise OSError(f"cannot write into {folder}: {error.strerror or error}. Choose another folder.") from error
     return folder
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk; where folders cannot be opened, the system sees to that by itself."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def _umask() -> int:

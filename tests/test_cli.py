@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from physjax.cli import main
@@ -89,3 +90,33 @@ def test_no_command_explains_itself(capsys):
     with pytest.raises(SystemExit):
         main([])
     assert "COMMAND" in capsys.readouterr().err
+
+
+def test_sweep_goes_over_the_numbers_of_a_scene_and_draws(tmp_path, capsys):
+    command = ["sweep", "projectile", "--over", "speed=10:20:3", "angle=0.3:1.2:4", "--outcome", "distance"]
+    assert main([*command, "--steps", "64", "--out", str(tmp_path)]) == 0
+    captured = capsys.readouterr()
+    assert "most: 39.7489 at speed = 20, angle = 0.9" in captured.out  # v² sin 2θ / g
+    assert "12.0/12.0" in captured.err
+    assert (tmp_path / "sweep.png").stat().st_size > 10_000
+    with np.load(tmp_path / "sweep.npz") as kept:
+        speed, angle = kept["axis.speed"][:, None], kept["axis.angle"]
+        np.testing.assert_allclose(kept["value.distance"], speed**2 * np.sin(2 * angle) / 9.8, rtol=1e-9)
+    assert main([*command, "--steps", "96", "--out", str(tmp_path)]) == 2
+    assert "holds another sweep" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("over", "outcome", "told"),
+    [
+        ("nodes=5:7:3", "height", "differ in more than numbers"),
+        ("nodes=5:6:3", "height", "expected whole numbers: it counts something"),
+        ("notes=5:7:3", "height", "unknown number of hanging_rope 'notes'. Did you mean nodes"),
+        ("mass=1:2", "height", "--over: got 'mass=1:2', expected NAME=LOW:HIGH:COUNT"),
+        ("mass=1:2:3", "hight", "Did you mean height"),
+    ],
+)
+def test_sweep_refuses_in_plain_words(tmp_path, capsys, over, outcome, told):
+    command = ["sweep", "hanging_rope", "--over", over, "--outcome", outcome, "--out", str(tmp_path)]
+    assert main(command) == 2
+    assert told in capsys.readouterr().err

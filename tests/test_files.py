@@ -92,3 +92,13 @@ def test_a_folder_without_the_right_to_write_is_a_plain_error(tmp_path):
             writable_folder(tmp_path)
     finally:
         tmp_path.chmod(0o700)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders can be opened on POSIX")
+def test_a_durable_file_is_on_the_disk_before_it_takes_its_place_and_its_name_after(tmp_path, monkeypatch):
+    done, sync, replace = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append(stat.S_ISDIR(os.fstat(handle).st_mode)), sync(handle)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
+    with replacing(tmp_path / "result.txt", durable=True) as file:
+        file.write("here")
+    assert done == [False, "replace", True]

@@ -39,7 +39,8 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
     """
     walls = _walls(scene)
     since = tuple(wall.touching_since for wall in walls)
-    anywhere = any_lane(jnp.any(jnp.isfinite(jnp.stack(since)), axis=0))
+    # a lane that is lost rests nowhere: the others must not take another path, in other roundings, because of it
+    anywhere = any_lane(jnp.any(jnp.isfinite(jnp.stack(since)), axis=0) & scene.finite(scene.state))
     # a branch also keeps the step apart from what reads it: XLA would compute it again in every reader
     end, since = lax.cond(
         anywhere,
@@ -51,7 +52,7 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
         meets = meets & ~scene.held
     # a plain function may hold arrays of its own that cannot be cut, and a path is one of all lanes
     cut = scene.led is None and not any(isinstance(force, Function) for force in scene.forces)
-    end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), scene, t, dt, cut=cut)
+    end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), meets, scene, t, dt, cut=cut)
     return scene.having(state=end, contacts=_remembered(scene.contacts, list(since)))
 
 
@@ -85,12 +86,12 @@ class _Leg(NamedTuple):
 
 
 def _through_touches(
-    motion: Callable, changing: tuple[Particles, tuple], scene: Scene, t: ArrayLike, dt: ArrayLike
+    motion: Callable, changing: tuple[Particles, tuple], meets: Array, scene: Scene, t: ArrayLike, dt: ArrayLike
 ) -> tuple[Particles, tuple]:
-    """The step again, leg by leg from touch to touch."""
+    """The step again, leg by leg from touch to touch, of lanes that may meet something; the others are where they arrived."""
     walls, dt = _walls(scene), jnp.broadcast_to(dt, scene.state.lanes)
-    since = tuple(wall.touching_since for wall in walls)
-    leg = _Leg(jnp.zeros_like(dt), scene.state, since, jnp.zeros(dt.shape, bool))
+    begun = scene.state, tuple(wall.touching_since for wall in walls)
+    leg = _Leg(jnp.zeros_like(dt), *_where(meets, begun, changing), ~meets)
 
     def go_on(leg, _):
         more = any_lane(~leg.arrived)

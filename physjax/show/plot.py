@@ -15,10 +15,11 @@ from physjax.show.solids import bodies
 from physjax.show.stage import AZIMUTH, ELEVATION
 from physjax.show.strands import springs
 from physjax.show.surfaces import cloth
+from physjax.show.sweeps import sweep
 from physjax.stepping.methods import METHODS
 from physjax.trajectory import Trajectory
 
-__all__ = ["bodies", "cloth", "gradient_health", "paths", "solids", "springs", "style", "work_precision"]
+__all__ = ["bodies", "cloth", "gradient_health", "paths", "solids", "springs", "style", "sweep", "work_precision"]
 
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
 """Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""

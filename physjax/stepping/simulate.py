@@ -8,7 +8,7 @@ O(frames + √save_every).
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.lanes import FEWEST, in_pieces
@@ -116,12 +116,12 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
 _rollout = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"))
 # XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster; JAX lets us
 # ask only where no other transformation is around the run
-_WIDE = {"xla_cpu_prefer_vector_width": 512}
-_rollout_alone = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=_WIDE)
+WIDE = {"xla_cpu_prefer_vector_width": 512}
+_rollout_alone = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=WIDE)
 # timed contacts are many small computations, over which the emitters of jax 0.10 take twice the time of the older ones
 _OLDER = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 _rollout_of_few = jax.jit(
-    _compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=_WIDE | _OLDER
+    _compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=WIDE | _OLDER
 )
 
 
@@ -171,6 +171,32 @@ def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: Array
 
     _, states = lax.scan(frame, moving, jnp.arange(frames, dtype=jnp.int32))
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), scene.state, states)
+
+
+class StateAfter(NamedTuple):
+    """The state at the end, the steps taken and their length [s], and whether the state is finite, as in a `Trajectory`."""
+
+    state: Any
+    steps: Int[Array, ""]
+    dt: Float[Array, ""]
+    ok: Bool[Array, "..."]
+
+
+def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: ArrayLike) -> StateAfter:
+    """The state after a `duration` [s] in equal steps of about `dt` [s]: the nearest count that fits, at least one.
+
+    The count is data, not shape, so that one program serves every dt, also under jit and vmap: this is how dt is swept.
+    Both are one number for the scene. Forward derivatives only.
+    """
+    duration = real_quantity("duration [s]", duration, above=0.0).astype(scene.state.dtype)
+    dt = real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype)
+    if duration.shape or dt.shape:
+        raise ValueError(f"state_after: got shapes {duration.shape} and {dt.shape}, expected one duration and one dt.")
+    steps = jnp.maximum(1, jnp.round(duration / dt)).astype(jnp.int32)
+    dt = duration / steps.astype(dt.dtype)
+    states = sample(scene, as_module(method), dt, steps, 1)
+    end = jax.tree.map(lambda leaf: leaf[-1], states)
+    return StateAfter(end, steps, dt, scene.finite(end))
 
 
 def _changing(scene: Scene, dt: ArrayLike) -> Any:

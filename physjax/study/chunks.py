@@ -1,0 +1,297 @@
+"""A folder of finished chunks: each is whole or absent, knows which sweep it is of, and is checked by its own name.
+
+`manifest.json` says what the sweep is. `chunk-00000012-<sha256 of the file>.npz` holds lanes 12·batch and on, readable
+by `numpy.load`: an array for each number that the measure returns, `status`, and `sweep`, the manifest's identity.
+"""
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import zipfile
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from physjax.files import replacing, writable_folder
+
+CHUNK = re.compile(r"chunk-(\d{8})-([0-9a-f]{64})\.npz")
+HALF = re.compile(r"\.chunk-(\d{8})-.*")
+"""What a killed process leaves of a chunk that it was writing."""
+MANIFEST = "manifest.json"
+SAYS = {
+    "axes": "other values on the axes",
+    "design": "another design",
+    "measure": "another measure, or one with other constants",
+    "versions": "other versions",
+    "backend": "another kind of device",
+    "outputs": "other results",
+    "batch": "another number of lanes in a chunk",
+    "block": "another number of lanes in a block",
+    "shape": "another shape",
+}
+"""What the entries of a manifest mean where they differ."""
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that decide about bits."""
+    return {name: version(name) for name in ("jax", "jaxlib", "numpy")}
+
+
+def identity(manifest: Mapping[str, Any]) -> str:
+    """A hash of a manifest."""
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+
+
+class Store(ABC):
+    """Where the chunks of one sweep are kept."""
+
+    def __init__(self, manifest: dict[str, Any]):
+        self.manifest = manifest
+
+    @property
+    def chunks(self) -> int:
+        """How many there will be."""
+        return -(-self.lanes // self.manifest["batch"])
+
+    @property
+    def lanes(self) -> int:
+        """How many lanes there are."""
+        return math.prod(self.manifest["shape"])
+
+    def range(self, chunk: int) -> tuple[int, int]:
+        """The first lane of a chunk, and the one after the last."""
+        batch = self.manifest["batch"]
+        return chunk * batch, min((chunk + 1) * batch, self.lanes)
+
+    def empty(self) -> dict[str, np.ndarray]:
+        """Room for all lanes, none of which is there: zeros, and a status of -1."""
+        outputs = self.manifest["outputs"].items()
+        whole = {name: np.zeros((self.lanes, *shape), dtype) for name, (shape, dtype) in outputs}
+        whole["status"][:] = -1
+        return whole
+
+    @abstractmethod
+    def finished(self) -> dict[int, Any]:
+        """The chunks that are there, by number, to be `read`."""
+
+    @abstractmethod
+    def read(self, place: Any) -> dict[str, np.ndarray]:
+        """The arrays of a finished chunk."""
+
+    @abstractmethod
+    def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep a chunk."""
+
+    @abstractmethod
+    def gathered(self) -> dict[str, np.ndarray]:
+        """All lanes; those of chunks that are not there have status -1 and zeros."""
+
+    @abstractmethod
+    def share(self, processes: int) -> None:
+        """Wait until all processes have finished, and let each have all chunks."""
+
+
+class InMemory(Store):
+    """Chunks as parts of whole arrays."""
+
+    def __init__(self, manifest: dict[str, Any]):
+        super().__init__(manifest)
+        self.arrays = self.empty()
+
+    def finished(self) -> dict[int, slice]:
+        """None: a sweep in memory begins anew."""
+        return {}
+
+    def read(self, place: slice) -> dict[str, np.ndarray]:
+        """Some lanes."""
+        return {name: array[place] for name, array in self.arrays.items()}
+
+    def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Put a chunk in its place."""
+        for name, array in arrays.items():
+            self.arrays[name][slice(*self.range(chunk))] = array
+
+    def gathered(self) -> dict[str, np.ndarray]:
+        """The arrays as they are."""
+        return self.arrays
+
+    def share(self, processes: int) -> None:
+        """Send every process the chunks of all, as bytes, which no conversion of numbers can change."""
+        from jax.experimental.multihost_utils import process_allgather
+
+        batch, most = self.manifest["batch"], -(-self.chunks // processes)
+        lanes = lambda i: np.concatenate(  # noqa: E731
+            [np.arange(*self.range(chunk)) for chunk in range(i, self.chunks, processes)] or [np.zeros(0, int)]
+        )
+        mine = lanes(jax.process_index())
+        for array in self.arrays.values():
+            sent = np.zeros((most * batch, *array.shape[1:]), array.dtype)
+            sent[: mine.size] = array[mine]
+            received = np.asarray(process_allgather(sent.reshape(-1).view(np.uint8)))
+            for i, one in enumerate(received):
+                array[lanes(i)] = np.ascontiguousarray(one).view(array.dtype).reshape(sent.shape)[: lanes(i).size]
+
+
+class Folder(Store):
+    """Chunks as files."""
+
+    def __init__(self, path: Path, manifest: dict[str, Any]):
+        super().__init__(manifest)
+        self.path = path
+
+    def finished(self) -> dict[int, Path]:
+        """The files of finished chunks by number; ValueError for a file that is no chunk of this sweep by its name."""
+        found: dict[int, Path] = {}
+        for path in sorted(self.path.glob("chunk-*")):
+            named = CHUNK.fullmatch(path.name)
+            number = int(named[1]) if named else -1
+            if not 0 <= number < self.chunks or number in found:
+                raise ValueError(
+                    f"sweep: {path} is not a chunk of this sweep of {self.chunks}. Move it out of the folder."
+                )
+            found[number] = path
+        return found
+
+    def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a chunk, whole and on the disk when this returns; OSError in plain words when it cannot be."""
+        content = io.BytesIO()
+        np.savez(content, **arrays, sweep=np.array(identity(self.manifest)))
+        name = f"chunk-{chunk:08d}-{hashlib.sha256(content.getbuffer()).hexdigest()}.npz"
+        try:
+            with replacing(self.path / name, "wb", durable=True) as file:
+                file.write(content.getbuffer())
+        except OSError as error:
+            raise OSError(
+                f"sweep: cannot write chunk {chunk} of {self.chunks} into {self.path}: {error.strerror or error}. The finished "
+                "chunks are intact: make room, and run the same sweep again to go on."
+            ) from error
+
+    def read(self, path: Path) -> dict[str, np.ndarray]:
+        """The arrays of a chunk; ValueError naming a file that is damaged or of another sweep."""
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != CHUNK.fullmatch(path.name)[2]:
+            raise ValueError(
+                f"sweep: the chunk {path} is damaged: its content is not what was written. Delete it, and run the same sweep "
+                "again to have it computed anew."
+            )
+        try:
+            with np.load(io.BytesIO(content)) as archive:
+                arrays = dict(archive)
+        except (ValueError, zipfile.BadZipFile) as error:
+            raise ValueError(f"sweep: the chunk {path} was not written by a sweep ({error}). Move it out.") from error
+        if str(arrays.pop("sweep", "")) != identity(self.manifest):
+            raise ValueError(f"sweep: the chunk {path} belongs to another sweep. Move it out of the folder.")
+        return arrays
+
+    def gathered(self) -> dict[str, np.ndarray]:
+        """All lanes of all finished chunks; lanes of others have status -1 and zeros."""
+        whole = self.empty()
+        for chunk, path in self.finished().items():
+            for name, array in self.read(path).items():
+                whole[name][slice(*self.range(chunk))] = array
+        return whole
+
+    def share(self, processes: int) -> None:
+        """Wait; the folder is there for all."""
+        from jax.experimental.multihost_utils import sync_global_devices
+
+        sync_global_devices(f"sweep {identity(self.manifest)}")
+
+
+@contextmanager
+def opened(
+    path: str | os.PathLike, manifest: dict[str, Any], shard: tuple[int, int], axes: Mapping
+) -> Iterator[Folder]:
+    """The folder of a sweep, locked for one process or shard; ValueError if it is in use or holds another sweep.
+
+    The locks are the system's and go with the process, however it ends. A new folder also gets the axes, as `axes.npz`.
+    """
+    path = writable_folder(path)
+    i, n = shard
+    with _locked(path / ".lock", shared=n > 1, who=path), _locked(path / f".lock-{i}-of-{n}", shared=False, who=path):
+        with _locked(path / ".lock-manifest", shared=False, who=path, wait=True):
+            folder = Folder(path, _agreed(path, manifest, axes))
+        for half in path.iterdir():
+            if (named := HALF.fullmatch(half.name)) and int(named[1]) % n == i:
+                half.unlink()
+        yield folder
+
+
+def found(path: str | os.PathLike) -> Folder:
+    """A folder that a sweep has written into."""
+    try:
+        manifest = json.loads((Path(path) / MANIFEST).read_text(encoding="utf-8"))
+        if identity(manifest["sweep"]) != manifest["identity"]:
+            raise ValueError("it was changed")
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"sweep: there is no sweep in {path}: it has no {MANIFEST}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"sweep: {Path(path) / MANIFEST} is damaged ({error}). Use another folder.") from error
+    return Folder(Path(path), manifest["sweep"])
+
+
+def begun(path: str | os.PathLike) -> tuple[int, int] | None:
+    """Lanes in a chunk and in a block of the sweep that has begun in a folder; None where there is none."""
+    if not (Path(path) / MANIFEST).exists():
+        return None
+    manifest = found(path).manifest
+    return manifest["batch"], manifest["block"]
+
+
+def _agreed(path: Path, manifest: dict[str, Any], axes: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The folder's manifest, written if there is none; ValueError saying in what it differs from this one."""
+    manifest = json.loads(json.dumps(manifest))
+    if (path / MANIFEST).exists():
+        old = found(path).manifest
+        differing = [key for key in manifest if old.get(key) != manifest[key]]
+        if differing:
+            told = "; ".join(f"{SAYS.get(key, key)} ({_difference(old.get(key), manifest[key])})" for key in differing)
+            raise ValueError(f"sweep: {path} holds another sweep: {told}. Choose another folder, or sweep as before.")
+        return old
+    if any(path.glob("chunk-*")):
+        raise ValueError(
+            f"sweep: {path} holds chunks but no {MANIFEST}, so nobody knows of what. Choose another folder."
+        )
+    with replacing(path / "axes.npz", "wb", durable=True) as file:
+        np.savez(file, **axes)
+    with replacing(path / MANIFEST, durable=True) as file:
+        json.dump({"identity": identity(manifest), "sweep": manifest}, file, indent=1)
+    return manifest
+
+
+def _difference(old: Any, new: Any) -> str:
+    """In what two entries differ; long hashes are cut."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+        return ", ".join(f"{key}: {_difference(old.get(key), new.get(key))}" for key in keys)
+    return f"{str(old)[:16]} there, {str(new)[:16]} here"
+
+
+@contextmanager
+def _locked(path: Path, shared: bool, who: Path, wait: bool = False) -> Iterator[None]:
+    """Hold a lock file; where another process does, wait, or raise a ValueError at once."""
+    import fcntl  # POSIX: elsewhere sweeps are kept in memory
+
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError as error:
+            raise ValueError(
+                f"sweep: another process is at work in {who}. Wait for it, or let both share the work: shard=(0, 2) in one, "
+                "shard=(1, 2) in the other."
+            ) from error
+        yield
+
+
+def backend() -> str:
+    """The kind of device and the precision, which decide about bits."""
+    return f"{jax.default_backend()}, x64 {'on' if jax.config.jax_enable_x64 else 'off'}"
