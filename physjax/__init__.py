@@ -13,7 +13,7 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from physjax import scenes
-    from physjax.physics import contacts, inertia, lattices, rigid, springs
+    from physjax.physics import contacts, emitters, fields, inertia, lattices, rigid, springs
     from physjax.physics.inertia import Inertia
     from physjax.physics.rigid import RigidBodies
     from physjax.show import animate, plot
@@ -37,7 +37,9 @@ __all__ = [
     "aim_at",
     "animate",
     "contacts",
+    "emitters",
     "energy",
+    "fields",
     "fit",
     "forces",
     "gradients",
@@ -69,7 +71,9 @@ _LATER = {
     "aim_at": "physjax.study.aim:aim_at",
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
+    "emitters": "physjax.physics.emitters",
     "energy": "physjax.study.energy",
+    "fields": "physjax.physics.fields",
     "fit": "physjax.study.fit:fit",
     "gradients": "physjax.study.gradients",
     "inertia": "physjax.physics.inertia",

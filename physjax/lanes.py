@@ -96,6 +96,33 @@ def on_flagged(function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *
     return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
 
 
+def on_runs(function: Callable, flagged: Callable, changing: Any, *others: Any) -> Any:
+    """`function(changing, *others)`, computed only where `flagged(changing, *others)`, for flags that stand side by side.
+
+    `changing` and what comes back are trees of arrays along one axis of lanes; the function must leave other lanes as they
+    are, and do away with the flag of those it is for. Windows slide to the next flagged lane until there is none: a
+    slice is copied where the lanes picked by `on_flagged` would be gathered and scattered. Reverse mode goes through.
+    """
+    total = len(jax.tree.leaves(changing)[0])
+    if total < FEWEST:
+        return lax.cond(any_lane(flagged(changing, *others)), lambda: function(changing, *others), lambda: changing)
+    size = math.ceil(total / SHARE)
+
+    def window(now):
+        first = jnp.minimum(jnp.argmax(flagged(now, *others)).astype(jnp.int32), total - size)
+        cut = partial(jax.tree.map, lambda leaf: lax.dynamic_slice_in_dim(leaf, first, size))
+        done = function(cut(now), *map(cut, others))
+        return jax.tree.map(lambda a, b: lax.dynamic_update_slice_in_dim(a, b, first, 0), now, done)
+
+    def where_left(go_on, now):
+        return lax.cond(any_lane(flagged(now, *others)), lambda: go_on(now), lambda: now)
+
+    once = partial(where_left, window)
+    # the last window is moved back to fit, and so may be one more for lanes that come round to the first
+    rest = lambda now: lax.scan(lambda now, _: (once(now), None), now, length=SHARE)[0]  # noqa: E731
+    return where_left(rest, once(changing))
+
+
 def _census(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
     """The flags as words of 32 bits, and how many are set up to and in each word: bit b of word w is lane b·words + w."""
     length = math.ceil(flag.size / 32)

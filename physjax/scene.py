@@ -70,15 +70,20 @@ class Contact(eqx.Module):
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after a touch; lanes that touch nothing stay as they are."""
 
-    def changes(self) -> "Contact":
-        """The contact with True in place of each array that a step changes, False elsewhere."""
-        mask = jax.tree.map(lambda _: False, self)
-        where = lambda contact: [getattr(contact, name) for name in self.memory]  # noqa: E731
-        return eqx.tree_at(where, mask, [True] * len(self.memory)) if self.memory else mask
+    def forgetting(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
+        """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
+        return self
 
     def prepared(self, state: Particles, couples: bool) -> "Contact":
         """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
         return self
+
+
+def changes(part: Any) -> Any:
+    """A part of a scene with True in place of each array that its `memory` names, False elsewhere."""
+    mask = jax.tree.map(lambda _: False, part)
+    where = lambda part: [getattr(part, name) for name in part.memory]  # noqa: E731
+    return eqx.tree_at(where, mask, [True] * len(part.memory)) if getattr(part, "memory", ()) else mask
 
 
 def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "Scene":
@@ -107,13 +112,13 @@ class Function(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """Everything a run needs but the method: state, mass [kg], forces, contacts, and which lanes are held or led.
+    """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held or led, or born.
 
     `mass` is a scalar or per lane, an `Inertia` for rigid bodies. `forces` are library forces or any callable
     `(t, state, mass) -> newtons`. `pinned` is a boolean mask over the lanes that are held, or `Pins(nodes, path)`, which
-    leads them. Every number becomes an array of the state's dtype: changing it compiles nothing, and it can be swept
-    and differentiated. Raises ValueError or TypeError for shapes that do not match, numbers that are not finite, and
-    masses <= 0.
+    leads them. With an `emitter` the lanes are born and die. Every number becomes an array of the state's dtype:
+    changing it compiles nothing, and it can be swept and differentiated. Raises ValueError or TypeError for shapes that
+    do not match, numbers that are not finite, and masses <= 0.
     """
 
     state: Any
@@ -121,6 +126,7 @@ class Scene(eqx.Module):
     forces: tuple
     contacts: tuple
     pinned: Bool[Array, "*lanes"] | eqx.Module | None
+    emitter: eqx.Module | None
     reaction: Callable | None = eqx.field(init=False)
 
     def __init__(
@@ -130,6 +136,7 @@ class Scene(eqx.Module):
         forces: Any = (),
         contacts: Any = (),
         pinned: Any = None,
+        emitter: Any = None,
     ):
         if not hasattr(state, "checked"):
             raise TypeError(
@@ -159,6 +166,7 @@ class Scene(eqx.Module):
         self.contacts = tuple(contact.prepared(state, self.couples) for contact in contacts)
         self.pinned = pinned
         self.reaction = None
+        self.emitter = None if emitter is None else emitter.prepared(self)
 
     @property
     def couples(self) -> bool:
@@ -247,7 +255,7 @@ class Scene(eqx.Module):
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
             motion = partial(response, motion)
-        after = motion(self, t, dt)
+        after = motion(self, t, dt) if self.emitter is None else self.emitter.live(motion, self, t, dt)
         state = after.state
         if self.led is not None:
             state = self.led.lead(t + dt, state)

@@ -24,9 +24,9 @@ class Trajectory(eqx.Module):
     """Frames of a run. `.time` [s] is `(frames,)`; `.state` has a leading axis of frames, frame 0 the start.
 
     `.ok` says whether the state stayed finite, per lane (per scene where lanes are coupled); `.first_bad_step` where it
-    did not. `.parts` are the forces and contacts that remember, with the arrays they changed at every frame. `.recorded` replaces
-    `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of the run, from which it
-    can be resumed.
+    did not. `.parts` are the forces, contacts and emitter that remember, with the arrays they changed at every frame.
+    `.recorded` replaces `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of
+    the run, from which it can be resumed.
     """
 
     time: Float[Array | np.ndarray, "frames *lanes"]
@@ -191,15 +191,16 @@ def _first_bad_step(scene, method, dt, first_step, steps):
 
 
 def memories(scene: Scene) -> tuple:
-    """Those of the scene's parts that remember: forces that advance, contacts that know who touches them."""
-    return tuple(part for part in (*scene.forces, *scene.contacts) if _remembers(part))
+    """Those of the scene's parts that remember: forces that advance, contacts that know who touches them, an emitter."""
+    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if _remembers(part))
 
 
 def _remembering(scene: Scene, state: Any, parts: tuple) -> Scene:
     """The scene with another state, and with other memories in those of its parts that have some."""
     parts = iter(parts)
     renewed = lambda old: tuple(next(parts) if _remembers(part) else part for part in old)  # noqa: E731
-    return scene.having(state=state, forces=renewed(scene.forces), contacts=renewed(scene.contacts))
+    forces, contacts, (emitter,) = renewed(scene.forces), renewed(scene.contacts), renewed((scene.emitter,))
+    return scene.having(state=state, forces=forces, contacts=contacts, emitter=emitter)
 
 
 def _remembers(part: Any) -> bool:

@@ -130,6 +130,12 @@ class Surface(Contact):
         """The surface with another memory of when each lane began to touch it, wall by wall."""
         return eqx.tree_at(lambda surface: surface.touching_since, self, since[0], is_leaf=lambda leaf: leaf is None)
 
+    def forgetting(self, lanes: Bool[Array, "*lanes"]) -> "Surface":
+        """The surface with some lanes as if they had never touched it."""
+        if not self.memory:
+            return self
+        return self.remembering([jnp.where(lanes, jnp.inf, wall.touching_since) for wall in self.walls()])
+
     def _still(self, t: ArrayLike, position: Array) -> Array:
         """Positions as the surface sees them, which thinks that it stands where it was at t = 0."""
         return position if self.velocity is None else position - scale(t, over(self.velocity, position))

@@ -11,6 +11,7 @@ from typing import Any
 from jax.typing import ArrayLike
 
 from physjax.checks import positive_integer, real_quantity
+from physjax.show.clouds import cloud_of
 from physjax.show.films import Film, schedule
 from physjax.show.panels import scenery_of
 from physjax.show.solids import taken_bodies
@@ -98,4 +99,15 @@ def paths(
     return Film(scenery, frames, fps, draw, axes=axes)
 
 
-__all__ = ["Film", "bodies", "cloth", "paths", "springs"]
+def particles(film: Trajectory, *, fps: int | float = 30.0, speed: int | float = 1.0) -> Film:
+    """Particles that are born and die, with the size, colour and opacity of their age; see `plot.particles`.
+
+    Raises TypeError or ValueError for a run without an emitter, and for `fps` or `speed` that do not fit.
+    """
+    who = "animate.particles"
+    seen, draw = cloud_of(who, film)
+    frames, fps = schedule(who, seen, fps, speed)
+    return Film(scenery_of(seen, frames), frames, fps, draw)
+
+
+__all__ = ["Film", "bodies", "cloth", "particles", "paths", "springs"]

@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.show import solids
+from physjax.show.clouds import particles
 from physjax.show.report import seconds_text
 from physjax.show.solids import bodies
 from physjax.show.stage import AZIMUTH, ELEVATION
@@ -19,7 +20,18 @@ from physjax.show.sweeps import sweep
 from physjax.stepping.methods import METHODS
 from physjax.trajectory import Trajectory
 
-__all__ = ["bodies", "cloth", "gradient_health", "paths", "solids", "springs", "style", "sweep", "work_precision"]
+__all__ = [
+    "bodies",
+    "cloth",
+    "gradient_health",
+    "particles",
+    "paths",
+    "solids",
+    "springs",
+    "style",
+    "sweep",
+    "work_precision",
+]
 
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
 """Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""

@@ -71,7 +71,7 @@ def reference(
         raise ValueError("reference: times must be a list of ascending finite numbers >= 0 [s].")
     real_quantity("rtol", rtol, above=0.0)
     real_quantity("atol", atol, above=0.0)
-    if any(hasattr(force, "advance") for force in scene.forces):
+    if scene.emitter is not None or any(hasattr(force, "advance") for force in scene.forces):
         raise ValueError(
             "reference: the scene has parts that remember, which an ordinary differential equation has not. Remove them."
         )

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from physjax.checks import positive_integer, real_quantity
 from physjax.lanes import FEWEST, in_pieces
 from physjax.loops import repeat, time_at
-from physjax.scene import Scene, as_module, plain_functions
+from physjax.scene import Scene, as_module, changes, plain_functions
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
 
@@ -134,7 +134,8 @@ def _stands_alone(run: tuple) -> bool:
     """Whether a run on a CPU is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
     scene, method, *_ = run
     path = () if scene.led is None else (scene.led.path,)
-    parts = (*scene.forces, *scene.contacts, *path, method)
+    source = () if scene.emitter is None else (scene.emitter.source,)
+    parts = (*scene.forces, *scene.contacts, *path, *source, method)
     ours = all(map(_is_ours, (*map(type, parts), *(plain.function for plain in plain_functions(parts)))))
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
     return ours and not traced and jax.default_backend() == "cpu"
@@ -212,8 +213,9 @@ def _changing(scene: Scene, dt: ArrayLike) -> Any:
         return after
 
     jax.eval_shape(trace, scene)
-    contacts = tuple(contact.changes() for contact in scene.contacts)
-    return mask[0].having(state=jax.tree.map(lambda _: True, scene.state), contacts=contacts)
+    contacts = tuple(map(changes, scene.contacts))
+    state, emitter = jax.tree.map(lambda _: True, scene.state), changes(scene.emitter)
+    return mask[0].having(state=state, contacts=contacts, emitter=emitter)
 
 
 def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:

@@ -52,8 +52,9 @@ class Problem(NamedTuple):
 
     @property
     def is_ode(self) -> bool:
-        """Whether the scene is an ordinary differential equation: no contacts, and no force that remembers."""
-        return not self.scene.contacts and not any(hasattr(force, "advance") for force in self.scene.forces)
+        """Whether the scene is an ordinary differential equation: no contacts, no emitter, and no force that remembers."""
+        jumps = self.scene.contacts or self.scene.emitter is not None
+        return not jumps and not any(hasattr(force, "advance") for force in self.scene.forces)
 
     def reference(self) -> Trajectory:
         """The scene at `times`, in float64, as true as it can be had: NumPy arrays.

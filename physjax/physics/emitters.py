@@ -1,0 +1,283 @@
+"""Particles that are born and die: a fixed pool whose births are a closed form of slot and generation.
+
+The slots of the pool are born one after another, and again from the first on; birth number n = generation·pool + slot has
+its own moment, and its own numbers, drawn from the key folded with slot and generation. So nothing is accumulated: the
+film depends on the key alone, not on the step, the batch, or where the run was cut and resumed.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from physjax.checks import concrete, demand, positive_integer, quantity
+from physjax.lanes import on_runs
+from physjax.particles import Particles, demand_particles
+from physjax.physics.looks import Appearance, Look
+from physjax.physics.sources import Box, Disc, Mesh, Point, Source, Sphere, in_cone
+from physjax.vectors import components, over, scale, stacked, unit
+
+_DRAWS = 8
+"""Uniform numbers of a birth: three for the place, two for the direction, then speed, life and size."""
+
+
+class Birth(NamedTuple):
+    """What is fixed when a particle is born: the moment [s], its life [s] and size [m], place [m] and velocity [m/s]."""
+
+    time: Float[Array, "*births"]
+    life: Float[Array, "*births"]
+    size: Float[Array, "*births"]
+    position: Float[Array, "*births dim"]
+    velocity: Float[Array, "*births dim"]
+
+
+class Emitter(eqx.Module):
+    """A pool of particles born from a source: `Scene(emitter.unborn(), ..., emitter=emitter)`.
+
+    Births come one by one at a `rate` [1/s], or in bursts of `burst` particles (of the whole pool by default) `every` so
+    many seconds, from the time `start` on; with neither, once. A particle leaves with `speed` [m/s] in a direction
+    within the half-angle `cone` [rad] about `direction`, by default about the way out of the source, and lives for
+    `life` [s]. Of speed, life and size [m] each particle has its own, even within mean·(1 ± spread). `key` is a seed or a
+    `jax.random.key`.
+
+    Every number but the counts can be swept and differentiated (births at fixed generations). A slot that is needed
+    again before its particle has died is an error that names the pool needed; with `drop_oldest` the oldest makes way.
+    Time is that of the state's type: float32 counts 16 million births, and tells births apart while rate·eps·t < 1.
+    Raises ValueError or TypeError for numbers out of range.
+    """
+
+    memory: ClassVar[tuple[str, ...]] = ("generation", "born", "dies")
+
+    pool: int = eqx.field(static=True, converter=lambda value: positive_integer("pool", value))
+    source: Source
+    key: UInt32[Array, "words"] = eqx.field(converter=lambda key: _key_data(key), kw_only=True)
+    life: Float[Array, ""] = quantity("life", "s", above=0, kw_only=True)
+    speed: Float[Array, ""] = quantity("speed", "m/s", default=0.0, kw_only=True)
+    rate: Float[Array, ""] | None = quantity("rate", "1/s", above=0, default=None, kw_only=True)
+    every: Float[Array, ""] | None = quantity("time between bursts", "s", above=0, default=None, kw_only=True)
+    burst: int | None = eqx.field(static=True, default=None, kw_only=True)
+    start: Float[Array, ""] = quantity("start", "s", default=0.0, kw_only=True)
+    direction: Float[Array, "dim"] | None = quantity("direction", "1", default=None, kw_only=True)
+    cone: Float[Array, ""] = quantity("half-angle of the cone", "rad", at_least=0, default=0.0, kw_only=True)
+    size: Float[Array, ""] = quantity("size", "m", above=0, default=0.01, kw_only=True)
+    speed_spread: Float[Array, ""] = quantity("spread of the speed", "1", at_least=0, default=0.0, kw_only=True)
+    life_spread: Float[Array, ""] = quantity("spread of the life", "1", at_least=0, default=0.0, kw_only=True)
+    size_spread: Float[Array, ""] = quantity("spread of the size", "1", at_least=0, default=0.0, kw_only=True)
+    look: Look = eqx.field(default_factory=Look, kw_only=True)
+    drop_oldest: bool = eqx.field(static=True, default=False, kw_only=True)
+    slot: Int[Array, "pool"] | None = eqx.field(default=None, kw_only=True)
+    generation: Int[Array, "..."] | None = eqx.field(default=None, kw_only=True)
+    born: Float[Array, "..."] | None = eqx.field(default=None, kw_only=True)
+    dies: Float[Array, "..."] | None = eqx.field(default=None, kw_only=True)
+
+    def __post_init__(self):
+        # an array of its own, so that lanes that are taken apart keep their numbers
+        self.slot = jnp.arange(self.pool, dtype=jnp.int32)
+
+    def __check_init__(self):
+        if self.rate is not None and (self.every is not None or self.burst is not None):
+            raise ValueError("Emitter: got rate= and bursts (every=, burst=), expected one of them.")
+        if self.burst is not None:
+            if self.every is None:
+                raise ValueError("burst: got a number without every=, the time between bursts [s]. Give both.")
+            if self.pool % positive_integer("burst", self.burst):
+                raise ValueError(f"burst: got {self.burst}, expected a divisor of the pool of {self.pool}.")
+        for name, value in (("life", self.life_spread), ("size", self.size_spread)):
+            if concrete(value) is not None:
+                demand(f"spread of the {name} [1]", value, concrete(value) < 1, "numbers from 0 to below 1")
+        if concrete(self.cone) is not None:
+            demand("half-angle of the cone [rad]", self.cone, concrete(self.cone) <= 3.1416, "numbers from 0 to π")
+        if not self.drop_oldest:
+            self._demand_room()
+
+    def _demand_room(self):
+        """Raise a ValueError where a slot is needed again before its particle has died."""
+        life, spread, pace = concrete(self.life), concrete(self.life_spread), self._pace
+        pace = None if pace is None else concrete(pace)
+        if life is None or spread is None or pace is None:
+            return
+        longest, burst = float(np.max(life * (1 + spread))), self._burst
+        needed = burst * math.ceil(longest * float(np.max(pace)) / burst * (1 - 1e-6))
+        if needed > self.pool:
+            raise ValueError(
+                f"pool: got {self.pool} slots for {float(np.max(pace)):g} births a second that live up to {longest:g} s, "
+                f"expected at least {needed}. Give pool={needed}, or drop_oldest=True to let the oldest make way."
+            )
+
+    # births, as a closed form
+
+    @property
+    def _burst(self) -> int:
+        """Particles that are born together."""
+        return 1 if self.rate is not None else self.burst or self.pool
+
+    @property
+    def _pace(self) -> Array | None:
+        """Births a second on the long run; None where there is one burst only."""
+        return self.rate if self.every is None else self._burst / self.every
+
+    def birth_time(self, slot: Int[Array, "*births"], generation: Int[Array, "*births"]) -> Float[Array, "*births"]:
+        """When the particle of a slot and generation is born [s]: start + n/rate, or its burst's moment."""
+        if self._pace is None:
+            return jnp.broadcast_to(self.start, generation.shape)
+        before = (slot // self._burst * self._burst).astype(self.start.dtype)
+        return self.start + (generation.astype(self.start.dtype) * self.pool + before) / self._pace
+
+    def due(self, t: ArrayLike) -> Int[Array, "pool"]:
+        """The generation that each slot has been born in by a time [s]; -1 where it has not been born."""
+        since = jnp.asarray(t, self.start.dtype) - self.start
+        if self._pace is None:
+            bursts = jnp.where(since < 0, -1.0, 0.0).astype(since.dtype)
+        else:
+            bursts = jnp.maximum(jnp.floor(since * (self._pace / self._burst)), -1.0)
+        last = (bursts + 1) * self._burst - 1
+        # half a birth more, so that no rounding of the quotient falls short of a whole number
+        rounds = jnp.floor((last + 0.5) / self.pool)
+        begun = self.slot <= (last - rounds * self.pool).astype(jnp.int32)
+        return rounds.astype(jnp.int32) + begun.astype(jnp.int32) - 1
+
+    @eqx.filter_jit  # as one program wherever it is called: one operation after the other would round otherwise
+    def births(self, slot: Int[Array, "births"], generation: Int[Array, "births"]) -> Birth:
+        """The births of these slots in these generations, drawn from the key folded with both."""
+        u = self._drawn(slot, generation)
+        place, outward = self.source(u[:, :3])
+        axis = outward if self.direction is None else over(unit(self.direction), outward)
+        return Birth(
+            time=self.birth_time(slot, generation),
+            life=_spread(self.life, self.life_spread, u[:, 6]),
+            size=_spread(self.size, self.size_spread, u[:, 7]),
+            position=place,
+            velocity=scale(_spread(self.speed, self.speed_spread, u[:, 5]), in_cone(axis, self.cone, u[:, 3:5])),
+        )
+
+    def _drawn(self, slot: Array, generation: Array) -> Array:
+        key = jax.random.wrap_key_data(self.key, impl="threefry2x32")
+
+        def one(slot, generation):
+            own = jax.random.fold_in(jax.random.fold_in(key, slot), generation)
+            return jax.random.uniform(own, (_DRAWS,), self.start.dtype)
+
+        return jax.vmap(one)(slot, generation)
+
+    # as part of a scene
+
+    def unborn(self, dtype: Any = None) -> Particles:
+        """The state before the first birth: every particle rests where it will be born."""
+        emitter = self._cast(jnp.dtype(dtype or jnp.result_type(float)))
+        place = emitter.births(self.slot, jnp.zeros_like(self.slot)).position
+        return Particles(place, jnp.zeros_like(place))
+
+    def prepared(self, scene: Any) -> "Emitter":
+        """The emitter as part of a scene, its numbers in the state's type; its memory begins here. The checks are here."""
+        state = scene.state
+        demand_particles("emitter", state, "bodies are not born")
+        if state.position.shape != (self.pool, self.source.dim):
+            raise ValueError(
+                f"emitter: got a state of shape {state.position.shape}, expected {(self.pool, self.source.dim)}, one lane "
+                "for each slot of the pool. Start from emitter.unborn()."
+            )
+        if scene.couples:
+            raise ValueError(
+                "emitter: got forces that couple the lanes, expected independent lanes, since each has its own clock. "
+                "Wrap a plain function in forces.independent."
+            )
+        if scene.pinned is not None:
+            raise ValueError("emitter: got pinned= as well, expected one of them: who is not alive is held already.")
+        never = jnp.full(self.pool, jnp.inf, state.dtype)
+        return self._cast(state.dtype)._remembering(jnp.full(self.pool, -1, jnp.int32), never, -never)
+
+    def live(self, motion: Callable, scene: Any, t: ArrayLike, dt: ArrayLike) -> Any:
+        """One step of a scene in which particles are born and die inside it, each at its own moment.
+
+        Each lane has its own clock: it runs from birth, if that is in the step, and to death. For who does not live the
+        step is so short that nothing moves: a choice between vectors would cost several times the step.
+        """
+        emitter, state = self.emit(t + dt, scene.state)
+        born, dies, ends = emitter.born, emitter.dies, t + dt
+        begun, end = jnp.minimum(jnp.maximum(born, t), ends), jnp.minimum(dies, ends)
+        limits = jnp.finfo(state.dtype)
+        shortest = float(limits.tiny) / float(limits.eps)
+        # the step itself, not t + dt - t, which differs by rounding
+        lasts = jnp.where((born <= t) & (dies >= ends), dt, jnp.maximum(end - begun, shortest))
+        # the dead keep what they touched: who lies on a surface is not asked again whether it meets it
+        contacts = tuple(contact.forgetting(emitter.generation > self.generation) for contact in scene.contacts)
+        after = motion(scene.having(state=state, contacts=contacts, emitter=emitter), begun, lasts)
+        return after.having(state=after.state.held((ends < dies).astype(state.dtype)))
+
+    def emit(self, t: ArrayLike, state: Particles) -> tuple["Emitter", Particles]:
+        """All that are born by the time t [s], put where they were born; only their numbers are drawn."""
+        due = jnp.maximum(self.due(t), self.generation)
+
+        def newborn(changing, slot, due):
+            return due > changing[1]
+
+        def bear(changing, slot, due):
+            (x, v), generation, born, dies = changing
+            new, birth = due > generation, self.births(slot, due)
+            state = Particles(_chosen(new, birth.position, x), _chosen(new, birth.velocity, v))
+            ends = birth.time + birth.life
+            return state, due, jnp.where(new, birth.time, born), jnp.where(new, ends, dies)
+
+        changing = (state, self.generation, self.born, self.dies)
+        state, *memory = on_runs(bear, newborn, changing, self.slot, due)
+        return self._remembering(*memory), state
+
+    # what is seen
+
+    def alive(self, t: ArrayLike) -> Bool[Array, "*frames pool"]:
+        """Who is alive at the time t [s] of the scene, or at the times of a film's frames."""
+        t = _per_frame(t, self.dies)
+        return (self.born <= t) & (t < self.dies)
+
+    def age(self, t: ArrayLike) -> Float[Array, "*frames pool"]:
+        """Time since birth [s]; of the dead their whole life, of the unborn zero."""
+        seen = jnp.clip(_per_frame(t, self.dies), self.born, jnp.maximum(self.dies, self.born))
+        return jnp.where(self.generation < 0, 0.0, seen - self.born)
+
+    def appearance(self, t: ArrayLike) -> Appearance:
+        """Who is seen, how large [m], in which colour and how opaque, at the time t [s] or at a film's frames."""
+        flat = self.generation.ravel()
+        slot = jnp.broadcast_to(self.slot, self.generation.shape).ravel()
+        size = _spread(self.size, self.size_spread, self._drawn(slot, flat)[:, 7]).reshape(self.generation.shape)
+        life = jnp.where(self.generation < 0, 1.0, self.dies - self.born)
+        return self.look.seen(self.alive(t), size, self.age(t) / life)
+
+    def _remembering(self, generation: Array, born: Array, dies: Array) -> "Emitter":
+        where = lambda emitter: (emitter.generation, emitter.born, emitter.dies)  # noqa: E731
+        return eqx.tree_at(where, self, (generation, born, dies), is_leaf=lambda leaf: leaf is None)
+
+    def _cast(self, dtype: Any) -> "Emitter":
+        return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, self)
+
+
+def _spread(mean: Array, spread: Array, u: Array) -> Array:
+    """Even within mean·(1 ± spread)."""
+    return mean * (1.0 + spread * (2.0 * u - 1.0))
+
+
+def _chosen(flag: Array, a: Array, b: Array) -> Array:
+    """Vectors a where flagged, else b; by components, since a choice between whole vectors costs several times that."""
+    return stacked([jnp.where(flag, p, q) for p, q in zip(components(a), components(b), strict=True)])
+
+
+def _per_frame(t: ArrayLike, like: Array) -> Array:
+    t = jnp.asarray(t, like.dtype)
+    return t.reshape(t.shape + (1,) * (like.ndim - t.ndim)) if t.ndim else t
+
+
+def _key_data(key: Any) -> Array:
+    """The words of a key of JAX's default generator, or of a seed."""
+    if isinstance(key, int | np.integer):
+        key = jax.random.key(key)
+    if not jnp.issubdtype(getattr(key, "dtype", type(key)), jax.dtypes.prng_key):
+        raise TypeError(f"key: got {key!r}, expected a seed or jax.random.key(seed).")
+    return jax.random.key_data(key)
+
+
+__all__ = ["Appearance", "Birth", "Box", "Disc", "Emitter", "Look", "Mesh", "Point", "Source", "Sphere"]

@@ -1,0 +1,189 @@
+"""Where particles are born: each source is a shape that three numbers from 0 to 1 fill evenly.
+
+A source is called with uniform numbers `(*lanes, 3)` and returns the place [m] and the direction out of the shape there,
+both `(*lanes, dim)`. Its numbers can be swept and differentiated; where a particle is born moves with them.
+"""
+
+import math
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from physjax.checks import concrete, demand, quantity
+from physjax.vectors import components, cross, norm, over, scale, stacked, turn_left, unit
+
+
+class Source(eqx.Module):
+    """A shape that particles are born from."""
+
+    @property
+    @abstractmethod
+    def dim(self) -> int:
+        """Components of a place: 2 in the plane, 3 in space."""
+
+    @abstractmethod
+    def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
+        """Place [m] and outward direction for uniform numbers."""
+
+
+class Point(Source):
+    """All from one point; outward is any direction, all equally likely."""
+
+    at: Float[Array, "dim"] = quantity("place of the source", "m")
+
+    @property
+    def dim(self) -> int:
+        """Components of the point."""
+        return self.at.shape[-1]
+
+    def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
+        """The point itself, and an isotropic direction."""
+        outward = isotropic(u, self.dim)
+        return over(self.at, outward), outward
+
+
+class Disc(Source):
+    """Evenly from a disc of a radius [m] across `normal`; in the plane, from a line as long as its diameter."""
+
+    center: Float[Array, "dim"] = quantity("center of the disc", "m")
+    normal: Float[Array, "dim"] = quantity("normal of the disc", "1")
+    radius: Float[Array, ""] = quantity("radius of the disc", "m", at_least=0)
+
+    @property
+    def dim(self) -> int:
+        """Components of the center."""
+        return self.center.shape[-1]
+
+    def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
+        """r = R √u₀ at the angle 2πu₁, and the normal."""
+        normal = over(unit(self.normal), u[..., : self.dim])
+        if self.dim == 2:
+            across = scale(2.0 * u[..., 0] - 1.0, turn_left(normal))
+        else:
+            across = scale(jnp.sqrt(u[..., 0]), around(normal, 2 * math.pi * u[..., 1]))
+        return over(self.center, normal) + self.radius * across, normal
+
+
+class Box(Source):
+    """Evenly from all of a box between two corners [m]; outward is any direction, all equally likely."""
+
+    lower: Float[Array, "dim"] = quantity("lower corner", "m")
+    upper: Float[Array, "dim"] = quantity("upper corner", "m")
+
+    def __check_init__(self):
+        lower, upper = concrete(self.lower), concrete(self.upper)
+        if lower is not None and upper is not None:
+            demand("upper corner [m]", self.upper, upper >= lower, f"at least the lower corner {lower}")
+
+    @property
+    def dim(self) -> int:
+        """Components of a corner."""
+        return self.lower.shape[-1]
+
+    def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
+        """lower + u (upper - lower), and an isotropic direction."""
+        share = u[..., : self.dim]
+        # the place has taken the numbers; what is left after a stretch is as even, and independent of where that was
+        again = jnp.mod(4096.0 * u, 1.0)
+        return over(self.lower, share) + over(self.upper - self.lower, share) * share, isotropic(again, self.dim)
+
+
+class Sphere(Source):
+    """Evenly from a ball of a radius [m], in the plane a disc; with `shell=True` from its surface alone."""
+
+    center: Float[Array, "dim"] = quantity("center", "m")
+    radius: Float[Array, ""] = quantity("radius", "m", at_least=0)
+    shell: bool = eqx.field(static=True, default=False)
+
+    @property
+    def dim(self) -> int:
+        """Components of the center."""
+        return self.center.shape[-1]
+
+    def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
+        """R ∛u₂ (in the plane R √u₂) along an isotropic direction, which is also the outward one."""
+        outward = isotropic(u, self.dim)
+        share = jnp.ones_like(u[..., 2]) if self.shell else u[..., 2] ** (1 / self.dim)
+        return over(self.center, outward) + self.radius * scale(share, outward), outward
+
+
+class Mesh(Source):
+    """Evenly from the surface of a triangle mesh: `vertices` `(n, 3)` [m], `faces` `(m, 3)`; outward by their winding.
+
+    Raises ValueError for other shapes and for faces that name no vertex.
+    """
+
+    vertices: Float[Array, "1 n 3"]
+    faces: Int[Array, "1 m 3"]
+
+    def __init__(self, vertices: Array | np.ndarray, faces: Array | np.ndarray):
+        vertices, faces = jnp.asarray(vertices), np.asarray(faces)
+        if vertices.ndim != 2 or vertices.shape[-1] != 3 or faces.ndim != 2 or faces.shape[-1] != 3 or not faces.size:
+            raise ValueError(
+                f"Mesh: got vertices {vertices.shape} and faces {faces.shape}, expected (n, 3) and (m, 3) triangles."
+            )
+        if faces.min() < 0 or faces.max() >= vertices.shape[0]:
+            raise ValueError(
+                f"Mesh: got faces that name vertices {faces.min()} to {faces.max()}, expected 0 to {vertices.shape[0] - 1}."
+            )
+        # an axis in front, so that no list of faces is taken for one of lanes
+        self.vertices, self.faces = vertices[None], jnp.asarray(faces, jnp.int32)[None]
+
+    @property
+    def dim(self) -> int:
+        """Always 3."""
+        return 3
+
+    def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
+        """A face by its share of the area, then a + (1 - √u₁)(b - a) + √u₁u₂(c - a) in it; and the face's normal."""
+        corner = [jnp.take(self.vertices[0], self.faces[0, :, i], axis=0) for i in range(3)]
+        upto = jnp.cumsum(norm(cross(corner[1] - corner[0], corner[2] - corner[0])))
+        face = jnp.searchsorted(upto, u[..., 0] * upto[-1], side="right")
+        face = jnp.minimum(face, self.faces.shape[1] - 1).astype(jnp.int32)
+        a, b, c = (jnp.take(each, face, axis=0) for each in corner)
+        root = jnp.sqrt(u[..., 1])
+        place = a + scale(1 - root, b - a) + scale(root * u[..., 2], c - a)
+        return place, unit(cross(b - a, c - a))
+
+
+def isotropic(u: Float[Array, "*lanes 3"], dim: int) -> Float[Array, "*lanes dim"]:
+    """A direction, all equally likely: by Archimedes cos θ = 1 - 2u₁ is even on the sphere."""
+    angle = 2 * math.pi * u[..., 0]
+    if dim == 2:
+        return stacked([jnp.cos(angle), jnp.sin(angle)])
+    height = 2.0 * u[..., 1]
+    across = jnp.sqrt(height * (2.0 - height))
+    return stacked([across * jnp.cos(angle), across * jnp.sin(angle), 1.0 - height])
+
+
+def in_cone(
+    axis: Float[Array, "*lanes dim"], cone: Float[Array, ""], u: Float[Array, "*lanes 2"]
+) -> Float[Array, "*lanes dim"]:
+    """A direction within the half-angle `cone` [rad] about a unit axis, all equally likely; smooth in the angle, at 0 too.
+
+    In space sin(θ/2) = √u₀ sin(cone/2); in the plane the angle is even from -cone to cone.
+    """
+    if axis.shape[-1] == 2:
+        angle = cone * (2.0 * u[..., 0] - 1.0)
+        return scale(jnp.cos(angle), axis) + scale(jnp.sin(angle), turn_left(axis))
+    half = u[..., 0] * jnp.sin(cone / 2) ** 2
+    sine = 2.0 * jnp.sin(cone / 2) * jnp.sqrt(u[..., 0] * (1.0 - half))
+    return scale(1.0 - 2.0 * half, axis) + scale(sine, around(axis, 2 * math.pi * u[..., 1]))
+
+
+def around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Float[Array, "*lanes 3"]:
+    """The unit vector at an angle [rad] around a unit axis.
+
+    The frame is the one without a branch of T. Duff et al., "Building an orthonormal basis, revisited", J. Comput.
+    Graph. Tech. 6 (2017) 1.
+    """
+    x, y, z = components(axis)
+    sign = jnp.where(z < 0, -1.0, 1.0).astype(z.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = stacked([1.0 + sign * x * x * a, sign * b, -sign * x])
+    second = stacked([b, sign + y * y * a, -y])
+    return scale(jnp.cos(angle), first) + scale(jnp.sin(angle), second)
