@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from physjax.physics import contacts, inertia, lattices, rigid, springs
     from physjax.physics.inertia import Inertia
     from physjax.physics.rigid import RigidBodies
-    from physjax.show import animate, plot
+    from physjax.show import animate, export, plot
     from physjax.study import accuracy, energy, gradients, projectile, stability
     from physjax.study.aim import aim_at
     from physjax.study.fit import fit
@@ -37,6 +37,7 @@ __all__ = [
     "animate",
     "contacts",
     "energy",
+    "export",
     "fit",
     "forces",
     "gradients",
@@ -67,6 +68,7 @@ _LATER = {
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "energy": "physjax.study.energy",
+    "export": "physjax.show.export",
     "fit": "physjax.study.fit:fit",
     "gradients": "physjax.study.gradients",
     "inertia": "physjax.physics.inertia",
