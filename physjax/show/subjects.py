@@ -62,7 +62,8 @@ def subject(who: str, film: Trajectory, shown: Any, scene: Any = None, dims: tup
 
 
 def own(film: Trajectory) -> Any:
-    """What a film's scene says of its looks: solids for bodies, its springs, or None."""
+    """What a film's scene says of its looks: solids for bodies, its springs (not those of a line), or None."""
     if hasattr(film.state, "orientation"):
         return [solid_of(film.scene.mass, lane) for lane in np.ndindex(film.scene.state.position.shape[:-1])]
-    return next((force for force in film.scene.forces if isinstance(force, Springs)), None)
+    springs = [force for force in film.scene.forces if isinstance(force, Springs)]
+    return springs[0] if springs and film.position.shape[-1] > 1 else None
