@@ -72,7 +72,7 @@ def _draw(name: str, folder: Path) -> Entry:
     run = problem._replace(frames=max(problem.frames, FRAMES)).reference()
     figure = portrait.still(run, problem.looks)
     with replacing(folder / f"{name}.png", "wb") as file:
-        figure.savefig(file, dpi=125)
+        figure.savefig(file, dpi=125, bbox_inches="tight")
     plt.close(figure)
     portrait.moving(run, problem.looks).save(folder / f"{name}.gif", progress=False)
     return told

@@ -65,9 +65,12 @@ def _paths(film: Trajectory) -> Any:
     scenery.obstacles(ax, 0)
     limits = [(name, getattr(ax, f"get_{name}lim")()) for name in "xyz"[: seen.dim]]
     plot.paths(film, every=_every(film), ax=ax)
-    ax.set_aspect("equal", adjustable="box")
-    for name, limit in limits:
+    for name, limit in limits:  # paths take what room they need
         getattr(ax, f"set_{name}lim")(limit)
+    if scenery.flat:
+        ax.set_aspect("equal", adjustable="box")
+    else:
+        ax.set_box_aspect(scenery.stage.high - scenery.stage.low)
     ax.title.set_text("")
     return figure
 

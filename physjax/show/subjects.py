@@ -50,9 +50,15 @@ def subject(who: str, film: Trajectory, shown: Any, scene: Any = None, dims: tup
     """
     if shown is None and isinstance(film, Trajectory) and film.scene is not None and film.state is not None:
         shown = own(film)
+    bodies = isinstance(shown, Shape) or (isinstance(shown, list | tuple) and not hasattr(shown, "_fields"))
+    if scene is not None and (shown is None or bodies):
+        raise ValueError(
+            f"{who}: got scene={scene}, expected none: all lanes are drawn side by side. It picks one of a batch of "
+            "cloths, ropes or other lattices."
+        )
     if shown is None:
         return Dots(take_lanes(who, film, dims))
-    if isinstance(shown, Shape) or (isinstance(shown, list | tuple) and not hasattr(shown, "_fields")):
+    if bodies:
         return Bodies(*shapes_of(who, film, shown))
     if len(getattr(shown, "faces", ())):
         faces, nodes = faces_of(who, shown)

@@ -154,6 +154,8 @@ def test_what_does_not_fit_is_refused_in_plain_words(drape, swarm, tmp_path):
         animate.view(run, "cloth")
     with pytest.raises(TypeError, match="expected RigidBodies"):
         animate.view(run, solids.sphere(1.0))
+    with pytest.raises(ValueError, match="got scene=0, expected none: all lanes are drawn side by side"):
+        animate.view(swarm, scene=0)
     with pytest.raises(ValueError, match="plays for"):
         animate.view(run, sheet, speed=1e-6)
     with pytest.raises(ValueError, match=r"got a.gif, expected a name that ends in .html"):
