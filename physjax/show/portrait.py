@@ -9,7 +9,6 @@ from physjax.show import animate, plot
 from physjax.show.films import Film
 from physjax.show.panels import arranged, scenery_of
 from physjax.show.subjects import Bodies, Dots, Lines, Surface, own, subject
-from physjax.show.swarms import MOST_PATHS
 from physjax.show.takes import take_lanes
 from physjax.trajectory import Trajectory
 
@@ -77,4 +76,4 @@ def _paths(film: Trajectory) -> Any:
 
 def _every(film: Trajectory) -> int:
     """One lane in so many, that no more are drawn than the eye tells apart."""
-    return math.ceil(math.prod(film.position.shape[1:-1]) / MOST_PATHS)
+    return math.ceil(math.prod(film.position.shape[1:-1]) / plot.MOST_LANES)

@@ -11,8 +11,6 @@ from physjax.show.takes import Take
 
 FINEST = 16
 """A trail has at most so many pieces."""
-MOST_PATHS = 200
-"""Paths drawn of a scene with no more lanes than this; the eye tells no more apart."""
 
 
 class Swarm(NamedTuple):

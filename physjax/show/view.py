@@ -19,10 +19,11 @@ from physjax.show import obstacles
 from physjax.show.films import schedule
 from physjax.show.pages import demanded, filled, framed, shipped, write_page
 from physjax.show.panels import Scenery, scenery_of
+from physjax.show.plot import MOST_LANES
 from physjax.show.stage import AZIMUTH, ELEVATION
 from physjax.show.strands import strands_of
 from physjax.show.subjects import Bodies, Dots, Lines, Surface, subject
-from physjax.show.swarms import MOST_PATHS, swarm_of
+from physjax.show.swarms import swarm_of
 from physjax.show.takes import batch_index
 from physjax.trajectory import Trajectory
 
@@ -186,7 +187,7 @@ def _dots(who: str, seen: Dots, scenery: Scenery, frames: list[int], color: Any)
         "nodes": seen.take.position.shape[1],
         "places": packed(places(scenery, seen.take.position[frames].astype(float))),
         "colors": swarm.colours[:, :3].ravel().round(3).tolist(),
-        "paths": seen.take.position.shape[1] <= MOST_PATHS,
+        "paths": seen.take.position.shape[1] <= MOST_LANES,
     }
 
 
