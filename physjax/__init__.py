@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from physjax.physics import contacts, emitters, fields, inertia, lattices, rigid, springs
     from physjax.physics.inertia import Inertia
     from physjax.physics.rigid import RigidBodies
-    from physjax.show import animate, plot
+    from physjax.show import animate, export, plot
     from physjax.study import accuracy, energy, gradients, projectile, stability
     from physjax.study.aim import aim_at
     from physjax.study.fit import fit
@@ -39,6 +39,7 @@ __all__ = [
     "contacts",
     "emitters",
     "energy",
+    "export",
     "fields",
     "fit",
     "forces",
@@ -73,6 +74,7 @@ _LATER = {
     "contacts": "physjax.physics.contacts",
     "emitters": "physjax.physics.emitters",
     "energy": "physjax.study.energy",
+    "export": "physjax.show.export",
     "fields": "physjax.physics.fields",
     "fit": "physjax.study.fit:fit",
     "gradients": "physjax.study.gradients",

@@ -14,7 +14,7 @@ MOMENTS = 16
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns 0, or 2 with one plain line on standard error for bad input."""
+    """Run a command; returns 0, 1 if a part of it failed, or 2 with one plain line on standard error for bad input."""
     parser = argparse.ArgumentParser(prog="physjax", description="Game physics in JAX.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -26,8 +26,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chart.add_argument("--quick", action="store_true", help="coarser and faster")
     chart.set_defaults(run=lambda options: _chart(options.scenes, options.out, options.quick))
 
-    scenes = commands.add_parser("scenes", help="list the scenes of the gallery")
-    scenes.set_defaults(run=lambda options: _scenes())
+    scenes = commands.add_parser("scenes", help="list the scenes of the gallery, or draw them")
+    scenes.add_argument("--only", nargs="+", default=[], metavar="SCENE", help="these scenes; all by default")
+    scenes.add_argument(
+        "--render", metavar="DIR", help="write a picture and a short film of each, and a page with all of them"
+    )
+    scenes.set_defaults(run=lambda options: _scenes(options.only, options.render))
 
     stability = commands.add_parser("stability", help="which step is stable in a scene: predicted and measured limits")
     stability.add_argument("scene", metavar="SCENE", help="a name from `physjax scenes`, failures included")
@@ -71,20 +75,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     options = parser.parse_args(arguments)
     try:
-        options.run(options)
+        return options.run(options) or 0
     except (ValueError, OSError) as error:
         print(f"physjax: {error}", file=sys.stderr)
         return 2
+
+
+def _scenes(names: list[str], out: str | None) -> int:
+    """Print every scene, and every run that must fail; or draw the scenes. Returns 1 if one of them could not be drawn."""
+    from physjax.checks import known
+    from physjax.scenes import FAILURES, SCENES, title
+    from physjax.scenes.catalogue import entry
+    from physjax.show.report import table
+
+    chosen = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(SCENES)
+    if out is not None:
+        return _rendered(chosen, out)
+    for name in chosen:
+        print(entry(name)[0], end="\n\n", flush=True)
+    if not names:
+        print(table(["failure", "what it is"], [[name, title(name)] for name in FAILURES], align="<<"))
     return 0
 
 
-def _scenes() -> None:
-    """Print every scene, and every run that must fail, with its one-line description."""
-    from physjax.scenes import FAILURES, SCENES, title
-    from physjax.show.report import table
+def _rendered(names: list[str], out: str) -> int:
+    """Draw scenes with progress, and tell at the end which could not be drawn, and why."""
+    import matplotlib
 
-    for header, names in (("scene", SCENES), ("failure", FAILURES)):
-        print(table([header, "what it is"], [[name, title(name)] for name in names], align="<<"), end="\n\n")
+    from physjax.files import writable_folder
+    from physjax.scenes.catalogue import render
+
+    folder = writable_folder(out)
+    matplotlib.use("Agg")
+    failed = {}
+    with tqdm(total=len(names), desc="drawing", unit="scene", file=sys.stderr) as bar:
+        for name, error in render(names, folder):
+            bar.set_postfix_str(name)
+            bar.update()
+            if error is not None:
+                failed[name] = error
+    print(f"Gallery: {folder / 'index.html'}")
+    for name, error in failed.items():
+        print(f"physjax: {name} could not be drawn: {type(error).__name__}: {error}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 def _chart(names: list[str], out: str, quick: bool) -> None:

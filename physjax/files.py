@@ -1,6 +1,7 @@
-"""Files that are whole or absent: written under a temporary name beside their place, then renamed."""
+"""Files and folders that are whole or absent: written under a temporary name beside their place, then renamed."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +33,30 @@ def replacing(path: str | os.PathLike, mode: str = "w", *, durable: bool = False
             _sync_folder(path.parent)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
+    """Fill a temporary folder that becomes `path` when the block ends well, and vanishes when it does not.
+
+    Raises FileNotFoundError when the folder that `path` is to be in does not exist, and FileExistsError when there is
+    something at `path` already, unless it is an empty folder.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist. Create it first.")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FileExistsError(f"cannot write {path}: something is there. Choose a new or an empty folder.")
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        yield temporary
+        temporary.chmod(0o777 & ~_umask())
+        if path.exists():
+            path.rmdir()
+        os.replace(temporary, path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
 
 

@@ -102,6 +102,7 @@ def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float
     return Problem(
         hanging,
         duration=5.0,
+        looks=sheet,
         truths=(
             Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 2e-6),
             Truth("the nails carry the weight of the rest [N]", _carried, weight, 1e-6),
@@ -134,6 +135,7 @@ def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) ->
     return Problem(
         flying,
         duration=1.0,
+        looks=sheet,
         truths=(
             Truth("stays on its pole [m]", lambda f: f.position[:, pole] - f.position[0, pole], 0.0, 0.0),
             Truth(
@@ -180,6 +182,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
     return Problem(
         falling,
         duration=3.0,
+        looks=sheet,
         truths=(
             Truth("no node is in the ball [m]", into(0), 0.0, 1e-12),
             Truth("no node is under the floor [m]", into(1), 0.0, 1e-12),

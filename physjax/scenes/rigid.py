@@ -7,6 +7,7 @@ import numpy as np
 from physjax.physics import forces, inertia, rigid
 from physjax.scene import Scene
 from physjax.scenes.gallery import scene
+from physjax.show import solids
 from physjax.study.energy import ANGULAR_MOMENTUM, ENERGY
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
@@ -38,6 +39,7 @@ def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
     return Problem(
         thrown,
         duration=2 * np.pi / slip,
+        looks=solids.cylinder(0.1, 0.02),
         exact=exact,
         conserved=(ENERGY, ANGULAR_MOMENTUM),
         truths=(
@@ -82,6 +84,7 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
     return Problem(
         tops,
         duration=float(2 * np.pi / pace[0]),
+        looks=solids.cylinder(0.06, 0.02),
         exact=exact,
         conserved=(ENERGY,),
         truths=(
@@ -105,7 +108,9 @@ def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
     (I₂ - I₁)(2EI₃ - L²)/((I₃ - I₂)(L² - 2EI₁)), where L² > 2EI₂ (Landau and Lifshitz, Mechanics, section 37).
     """
     bar, grip = inertia.cylinder(0.15, 0.01, 0.2, axis=0), inertia.cylinder(0.1, 0.01, 0.1, axis=1)
-    handle = inertia.composite([(bar, (0.0, 0.0, 0.0)), (grip, (0.0, -0.06, 0.0))]).inertia
+    whole = inertia.composite([(bar, (0.0, 0.0, 0.0)), (grip, (0.0, -0.06, 0.0))])
+    handle = whole.inertia
+    shape = solids.cylinder(0.01, 0.2, axis=0).joined(solids.cylinder(0.01, 0.1, axis=1).at((0.0, -0.06, 0.0)))
     order = np.argsort(np.asarray(handle.principal))
     i1, i2, i3 = np.asarray(handle.principal, float)[order]
     omega = np.zeros(3)
@@ -119,6 +124,7 @@ def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
     return Problem(
         spun,
         duration=float(period),
+        looks=shape.at(-whole.center),
         conserved=(ENERGY, ANGULAR_MOMENTUM),
         truths=(
             Truth(
@@ -150,6 +156,7 @@ def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.
     return Problem(
         Scene(rigid.bodies(plank, place, start), plank, (forces.Gravity(g),)),
         duration=float(period),
+        looks=solids.box((0.08, length, 0.02)),
         conserved=(ENERGY,),
         truths=(
             Truth(

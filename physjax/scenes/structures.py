@@ -55,6 +55,7 @@ def jelly_cube(nodes: int = 4, side: float = 0.2, lean: float = 0.0, g: float = 
     return Problem(
         falling,
         duration=3.0,
+        looks=jelly,
         truths=(
             Truth("falls as a whole, ½gt², until it touches [m]", fall, 0.0, 1e-12),
             Truth("bounces: its middle rises again [m]", bounce, 0.1, 0.05),

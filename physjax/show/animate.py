@@ -1,7 +1,8 @@
 """Runs as films in real time: cloth, rigid bodies, springs, and particles with a trail behind them.
 
-Every function returns a `Film`, which shows itself in a notebook and has `.save("name.gif")` and `.save("name.html")`.
-It plays `speed` seconds of the run a second, in `fps` pictures, which are picked by the film's own time.
+Every other function returns a `Film`, which shows itself in a notebook and has `.save("name.gif")` and `.save("name.html")`.
+It plays `speed` seconds of the run a second, in `fps` pictures, which are picked by the film's own time. `view` returns
+a page on which the run can be turned as well.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from physjax.show.strands import colour_bar, lines, strands_of, take_springs
 from physjax.show.surfaces import surface
 from physjax.show.swarms import swarm_of, swarm_scenery
 from physjax.show.takes import faces_of, take, take_lanes
+from physjax.show.view import View, view
 from physjax.trajectory import Trajectory
 
 
@@ -110,4 +112,4 @@ def particles(film: Trajectory, *, fps: int | float = 30.0, speed: int | float =
     return Film(scenery_of(seen, frames), frames, fps, draw)
 
 
-__all__ = ["Film", "bodies", "cloth", "particles", "paths", "springs"]
+__all__ = ["Film", "View", "bodies", "cloth", "particles", "paths", "springs", "view"]

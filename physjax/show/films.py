@@ -1,5 +1,8 @@
 """Films: pictures in real time that show themselves in a notebook and are saved as a GIF or as a page of their own."""
 
+import base64
+import io
+import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -10,6 +13,7 @@ import numpy as np
 from physjax.checks import real_quantity
 from physjax.files import replacing
 from physjax.show import obstacles
+from physjax.show.pages import demanded, filled, framed, write_page
 from physjax.show.panels import Scenery, arranged
 from physjax.show.takes import Take
 
@@ -17,6 +21,8 @@ LONGEST = 600.0
 """A film that plays longer [s] is surely not meant."""
 GREYS, NEARLY_GREY = 32, 8
 """Greys among the 256 colours of a GIF, which are the same for all its frames, so that nothing flickers."""
+TOOLS = 70
+"""Room for the buttons below a film in a notebook [pixels]."""
 HUNDREDTH = 0.01
 """A GIF counts time in hundredths of a second."""
 
@@ -59,18 +65,16 @@ class Film:
         Raises ValueError for another ending and FileNotFoundError where there is no such folder, before anything is
         drawn. Returns the path.
         """
-        path = Path(path)
-        writers = {".gif": self._write_gif, ".html": self._write_html}
-        if path.suffix.lower() not in writers:
-            raise ValueError(f"save: got {path.name}, expected a name that ends in {' or '.join(writers)}.")
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist. Create it first.")
+        path = demanded(path, (".gif", ".html"))
+        if path.suffix.lower() == ".html":
+            return write_page(path, self._player(progress)[0])
         with replacing(path, "wb") as file:
-            writers[path.suffix.lower()](file, progress)
+            self._write_gif(file, progress)
         return path
 
     def _repr_html_(self) -> str:
-        return self._player(progress=True)
+        page, height = self._player(progress=True)
+        return framed(page, height + TOOLS)
 
     def _projector(self) -> tuple[Any, Callable]:
         """A figure, and what shows a frame of the run in it; pyplot knows nothing of it, and does not show it again."""
@@ -97,41 +101,38 @@ class Film:
         return figure, show
 
     def _write_gif(self, file: Any, progress: bool) -> None:
+        pictures = self._pictures(progress)
+        next(pictures).save(
+            file, "GIF", save_all=True, append_images=pictures, duration=self._durations(), loop=0, optimize=False
+        )
+
+    def _pictures(self, progress: bool) -> Iterator[Any]:
+        """The pictures, in the 256 colours that all of them share."""
         figure, show = self._projector()
         palette = _palette(
             [_picture(figure, show, self.frames[int(i)]) for i in np.linspace(0, len(self.frames) - 1, 3)]
         )
-        pictures = (
-            _picture(figure, show, frame).quantize(palette=palette, dither=0)
-            for frame in _counted(self.frames, progress)
-        )
-        next(pictures).save(
-            file, "GIF", save_all=True, append_images=pictures, duration=self._durations(), loop=0, optimize=False
-        )
+        for frame in _counted(self.frames, progress):
+            yield _picture(figure, show, frame).quantize(palette=palette, dither=0)
 
     def _durations(self) -> list[int]:
         """How long each picture stands [ms]: hundredths of a second that together keep real time."""
         ends = np.round(np.arange(len(self.frames) + 1) / self.fps / HUNDREDTH)
         return np.maximum(10 * np.diff(ends), 10).astype(int).tolist()
 
-    def _write_html(self, file: Any, progress: bool) -> None:
-        head = '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>physjax</title>\n'
-        file.write(f"{head}{self._player(progress)}</html>\n".encode())
-
-    def _player(self, progress: bool) -> str:
-        """The pictures with matplotlib's buttons, which bring their signs along instead of fetching them from a server."""
-        from matplotlib import rc_context
-        from matplotlib.animation import FuncAnimation
-
-        figure, show = self._projector()
-        bar = _counted(self.frames, progress)
-        film = FuncAnimation(
-            figure, show, frames=bar, init_func=lambda: None, save_count=len(self.frames), cache_frame_data=False
-        )
-        with rc_context({"animation.embed_limit": 2**20, "savefig.bbox": "standard"}):
-            player = film.to_jshtml(fps=self.fps, embed_frames=True, default_mode="loop")
-        before, _, rest = player.partition("<link")
-        return before + _SIGNS + rest.partition(">")[2]
+    def _player(self, progress: bool) -> tuple[str, int]:
+        """A page with all pictures in it, and buttons; and how high a picture is [pixels]."""
+        pictures = []
+        for picture in self._pictures(progress):
+            data = io.BytesIO()
+            picture.save(data, "WEBP", lossless=True)
+            pictures.append("data:image/webp;base64," + base64.b64encode(data.getvalue()).decode())
+        width, height = picture.size
+        time = self.scenery.take.time[list(self.frames)]
+        paced = time[:-1] if len(time) > 2 else time  # the end is shown when it is due, or a little early
+        speed = float(f"{np.polyfit(np.arange(len(paced)), paced, 1)[0] * self.fps:.2g}")
+        page = filled("film.html", WIDTH=width, HEIGHT=height, FPS=self.fps, SPEED=speed, PICTURES=json.dumps(pictures))
+        return page, height
 
 
 def schedule(who: str, take: Take, fps: int | float, speed: float) -> tuple[list[int], float]:
@@ -189,15 +190,3 @@ def _counted(frames: Sequence[int], progress: bool) -> Iterator[int]:
     from tqdm import tqdm
 
     return iter(tqdm(frames, desc="drawing", unit="picture", disable=not progress, leave=False))
-
-
-_SIGNS = """<style>
-.animation .fa { font-style: normal; }
-.animation .fa-minus::before { content: "\\2212"; } .animation .fa-plus::before { content: "+"; }
-.animation .fa-fast-backward::before { content: "\\23EE\\FE0E"; }
-.animation .fa-fast-forward::before { content: "\\23ED\\FE0E"; }
-.animation .fa-step-backward::before { content: "\\2039"; } .animation .fa-step-forward::before { content: "\\203A"; }
-.animation .fa-play::before { content: "\\25B6\\FE0E"; }
-.animation .fa-play.fa-flip-horizontal::before { content: "\\25C0\\FE0E"; }
-.animation .fa-pause::before { content: "\\23F8\\FE0E"; }
-</style>"""

@@ -70,7 +70,7 @@ def in_space(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
 
     drawn = []
     for contact in contacts:
-        sheets = [polygon for polygon in _sheets(contact, stage, t) if len(polygon) > 2]
+        sheets = [polygon for polygon in sheets_of(contact, stage, t) if len(polygon) > 2]
         if sheets:
             glass = 0.16 / math.sqrt(len(sheets))  # as many as stand behind each other
             drawn.append(
@@ -155,7 +155,8 @@ def _corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
     return [corners[nearest] - gaps[nearest] * normal] if near else []
 
 
-def _sheets(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
+def sheets_of(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
+    """The flat surfaces of a contact at a time as polygons `(corners, 3)` [m], where they cut the box; none of a ball."""
     if isinstance(contact, Plane):
         return [_cut(stage, _center(contact, t), _unit(contact.normal))]
     if isinstance(contact, Slab):

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from physjax.checks import real_quantity
+from physjax.physics.inertia import Inertia
 from physjax.physics.meshes import checked_mesh
 from physjax.show.panels import panels, scenery_of
 from physjax.show.surfaces import surface
@@ -86,6 +87,11 @@ def bodies(
 
 def taken_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray]:
     """The frames of a run with the vertices of all shapes in place of the bodies, and the triangles between them."""
+    return in_place(*shapes_of(who, film, shapes))
+
+
+def shapes_of(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray, list[Shape]]:
+    """Centres of mass of a run's bodies, their quaternions `(frames, bodies, 4)`, and a checked shape for each."""
     seen = take_lanes(who, film, dims=(3,))
     if not hasattr(film.state, "orientation"):
         raise TypeError(
@@ -96,12 +102,36 @@ def taken_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndar
     if len(shapes) != lanes or not all(isinstance(shape, Shape) for shape in shapes):
         raise ValueError(f"{who}: got {len(shapes)} shapes, expected a Shape for all {lanes} bodies or one for each.")
     shapes = [Shape(*checked_mesh(*shape, name=f"{who}: shape {i}")) for i, shape in enumerate(shapes)]
-    q = np.asarray(film.state.orientation, float).reshape(len(seen.time), lanes, 4)
+    return seen, np.asarray(film.state.orientation, float).reshape(len(seen.time), lanes, 4), shapes
+
+
+def in_place(seen: Take, orientation: np.ndarray, shapes: list[Shape]) -> tuple[Take, np.ndarray]:
+    """The shapes of bodies where they are: frames with all their vertices, and the triangles between them."""
     corners = [
-        seen.position[:, i, None] + _turned(q[:, i, None], shape.vertices[None]) for i, shape in enumerate(shapes)
+        seen.position[:, i, None] + _turned(orientation[:, i, None], shape.vertices[None])
+        for i, shape in enumerate(shapes)
     ]
     whole = shapes[0].joined(*shapes[1:])
     return seen._replace(position=np.concatenate(corners, axis=1)), whole.faces
+
+
+def solid_of(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
+    """The box of one density that has a body's mass and moments: edges a² = 6 (I₂ + I₃ - I₁)/m, and so on.
+
+    A body with a pivot has the moments about its centre of mass, I - m (|r|² 1 - r rᵀ), and an edge without a moment
+    across it is drawn thin. `lane` is the body's place in a batch.
+    """
+    own = lambda leaf, axes: np.asarray(leaf, float)[lane if np.ndim(leaf) > axes else ()]  # noqa: E731
+    mass, tensor = own(inertia.mass, 0), own(inertia.tensor, 2)
+    if inertia.arm is not None:
+        arm = own(inertia.arm, 1)
+        tensor = tensor - mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    moments, axes = np.linalg.eigh(tensor)
+    edges = np.sqrt(np.maximum(6 / mass * (moments.sum() - 2 * moments), 0.0))
+    edges = np.maximum(edges, 0.02 * edges.max())
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    solid = box(edges)
+    return solid._replace(vertices=solid.vertices @ axes.T)
 
 
 def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -32,9 +32,11 @@ class Swarm(NamedTuple):
             return [trail, ax.scatter(*position[seen].T, **dots)]
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-        trail = ax.add_collection3d(Line3DCollection(pieces, colors=colours, linewidths=1.2, zorder=3))
+        # matplotlib cannot add a collection of nothing in space
+        lines = [Line3DCollection(pieces, colors=colours, linewidths=1.2, zorder=3)] if len(pieces) else []
+        trail = [ax.add_collection3d(line) for line in lines]
         balls = obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame])
-        return [trail, ax.scatter(*position[seen].T, depthshade=True, **dots), *balls]
+        return [*trail, ax.scatter(*position[seen].T, depthshade=True, **dots), *balls]
 
     def _trail(self, take: Take, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Pieces `(pieces, 2, dim)` of the way up to a frame, and their colours, which fade towards the past."""

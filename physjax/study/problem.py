@@ -1,7 +1,7 @@
 """A scene that carries its own truth: how long to run it, what it must do, and how one knows."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ class Problem(NamedTuple):
 
     `exact(times)` is the closed form, NumPy float64 with a leading axis of times; None where there is none. `conserved`
     are quantities that the physics keeps constant. `frames` is the number of equally spaced moments at which errors are
-    measured.
+    measured. `looks` is what it is drawn as, a lattice with faces or the shapes of bodies; without it the scene says.
     """
 
     scene: Scene
@@ -44,6 +44,7 @@ class Problem(NamedTuple):
     conserved: tuple[Conserved, ...] = ()
     truths: tuple[Truth, ...] = ()
     frames: int = 32
+    looks: Any = None
 
     @property
     def times(self) -> np.ndarray:

@@ -94,7 +94,7 @@ def test_a_page_holds_all_its_pictures_and_fetches_nothing(ruin, tmp_path, capsy
     film = animate.springs(*ruin)
     film.save(tmp_path / "film.html")
     page = (tmp_path / "film.html").read_text(encoding="utf-8")
-    assert page.count("data:image/png;base64,") == len(film.frames) == 21
+    assert page.count("data:image/webp;base64,") == len(film.frames) == 21
     assert "://" not in page
     assert "<link" not in page
     assert page.startswith("<!doctype html>")
@@ -104,7 +104,7 @@ def test_a_page_holds_all_its_pictures_and_fetches_nothing(ruin, tmp_path, capsy
 def test_a_notebook_shows_it_once(swarm):
     film = animate.paths(swarm, fps=4)
     shown = film._repr_html_()
-    assert shown.count("data:image/png;base64,") == len(film.frames) == 5
+    assert shown.count("data:image/webp;base64,") == len(film.frames) == 5
     assert "film of 5 pictures" in repr(film).lower()
     assert not plt.get_fignums()
 

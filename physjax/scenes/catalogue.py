@@ -1,0 +1,132 @@
+"""The gallery to read and to look at: what each scene is, how large, and by what it is known to be right; its pictures."""
+
+import html
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from textwrap import fill
+from typing import NamedTuple
+
+from physjax.physics.springs import Springs
+from physjax.scenes.gallery import SCENES, title
+from physjax.study.problem import Problem
+
+FRAMES = 512
+"""A run is drawn from at least so many moments."""
+
+
+class Entry(NamedTuple):
+    """A scene by name: its one-line description, how large it is, and the truths that it is tested by."""
+
+    name: str
+    title: str
+    size: str
+    truth: str
+
+    def __str__(self) -> str:
+        lines = [f"{self.name}: {self.size}", self.title, f"truth: {self.truth}"]
+        return "\n".join(
+            fill(line, 110, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
+            for line, indent in zip(lines, (0, 4, 4), strict=True)
+        )
+
+
+def entry(name: str) -> tuple[Entry, Problem]:
+    """What is known of a scene, and the scene itself, in float64."""
+    import jax
+
+    with jax.enable_x64(True):
+        problem = SCENES[name]()
+    truths = [truth.statement for truth in problem.truths]
+    known = ["closed form"] if problem.exact is not None else []
+    return Entry(name, title(name), _size(problem), "; ".join(known + truths)), problem
+
+
+def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception | None]]:
+    """Write `name.png` and `name.gif` of each scene, and last a page `index.html` with all of them.
+
+    Yields each name when it is done, with what went wrong if something did: the others are drawn all the same.
+    """
+    from physjax.files import replacing
+
+    cards: list[str] = []
+    for name in names:
+        error = None
+        try:
+            cards.append(_card(_draw(name, folder)))
+        except Exception as reason:  # whatever it is, it is handed on, and the next scene is drawn
+            error = reason
+            cards.append(_card(Entry(name, title(name), "", f"could not be drawn: {reason}"), drawn=False))
+        yield name, error
+    with replacing(folder / "index.html") as file:
+        file.write(_PAGE.replace("__CARDS__", "\n".join(cards)))
+
+
+def _draw(name: str, folder: Path) -> Entry:
+    """Run a scene as its own reference and write both pictures."""
+    from matplotlib import pyplot as plt
+
+    from physjax.files import replacing
+    from physjax.show import portrait
+
+    told, problem = entry(name)
+    run = problem._replace(frames=max(problem.frames, FRAMES)).reference()
+    figure = portrait.still(run, problem.looks)
+    with replacing(folder / f"{name}.png", "wb") as file:
+        figure.savefig(file, dpi=125, bbox_inches="tight")
+    plt.close(figure)
+    portrait.moving(run, problem.looks).save(folder / f"{name}.gif", progress=False)
+    return told
+
+
+def _size(problem: Problem) -> str:
+    """How many of what, in how many dimensions, and for how long."""
+    from physjax.show.report import seconds_text
+
+    state, forces = problem.scene.state, problem.scene.forces
+    lanes = state.position[..., 0].size
+    one, many = ("body", "bodies") if hasattr(state, "orientation") else ("particle", "particles")
+    words = f"{lanes} {one if lanes == 1 else many}"
+    springs = sum(len(force.pairs) for force in forces if isinstance(force, Springs))
+    joined = f", {springs} springs" if springs else ""
+    return f"{words} in {state.position.shape[-1]}-D{joined}, {seconds_text(problem.duration)}"
+
+
+def _card(told: Entry, drawn: bool = True) -> str:
+    name, line, size, truth = map(html.escape, told)
+    picture = (
+        f'<button aria-label="play or stop {name}"><img src="{name}.png" data-other="{name}.gif" alt="{line}" '
+        'loading="lazy"></button>'
+    )
+    return (
+        f'<article id="{name}"><h2>{name}</h2>{picture if drawn else ""}<p>{line}</p>'
+        f'<p class="small">{size}</p><p class="small">{truth}</p></article>'
+    )
+
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>physjax: the gallery</title>
+<style>
+body { font: 16px/1.45 system-ui, sans-serif; max-width: 1280px; margin: 1.5em auto; padding: 0 1em; color: #222; }
+main { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 360px), 1fr)); gap: 1.5em; align-items: start; }
+article { border: 1px solid #ddd; border-radius: 8px; padding: 0 1em; overflow-wrap: break-word; }
+h2 { font-size: 1.15em; margin: .7em 0; }
+button { display: block; width: 100%; padding: 0; border: 0; background: none; cursor: pointer; }
+img { display: block; width: 100%; height: 260px; object-fit: contain; }
+.small { font-size: .85em; color: #555; }
+</style>
+<h1>physjax: the gallery</h1>
+<p>Each scene, and the truths that it is tested by. Press a picture to play it.</p>
+<main>
+__CARDS__
+</main>
+<script>
+for (const button of document.querySelectorAll("button")) button.onclick = () => {
+  const image = button.firstChild, other = image.dataset.other;
+  image.dataset.other = image.getAttribute("src"); image.src = other;
+};
+</script>
+</html>
+"""

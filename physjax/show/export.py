@@ -1,0 +1,202 @@
+"""Runs for Blender, engines and other programs: animated glTF, and PLY files frame by frame. `Trajectory.save` writes NPZ.
+
+What a film is exported as, `shown`, is as in `animate.view`: a lattice with faces, springs, a `solids` shape or one for
+each body; without it the scene says. Metres and y up. In the plane z is 0.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physjax.files import replacing, replacing_folder
+from physjax.show.films import schedule
+from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document
+from physjax.show.pages import demanded
+from physjax.show.subjects import Bodies, Dots, Lines, Surface, subject
+from physjax.show.takes import Take, batch_index, unbroken
+from physjax.trajectory import Trajectory
+
+__all__ = ["gltf", "ply"]
+
+MOST_SHAPES = 240
+"""Frames of what deforms in one glTF file: each is a morph target, and programs slow down or give up beyond a few hundred."""
+MOST_BYTES = 2**30
+"""Of the arrays in one glTF file; its own limit is four times that."""
+COLOR = "#56B4E9"
+
+
+def gltf(
+    film: Trajectory,
+    path: str | os.PathLike,
+    shown: Any = None,
+    *,
+    scene: int | Sequence[int] | None = None,
+    color: Any = COLOR,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
+    progress: bool = True,
+) -> Path:
+    """Write a run as an animated glTF file, .glb, whole or not at all; returns its path.
+
+    Bodies are nodes that move and turn. What deforms (a cloth, springs, dots) has a morph target for each frame, so that
+    it goes straight from one to the next: 12 bytes a node and frame, no normals, at most 240 frames and 1 GiB. It plays
+    `speed` seconds of the run a second, in `fps` frames. `color` is one for all. Numbers are float32.
+
+    Raises TypeError or ValueError for what does not fit, too many frames among them (choose a lower `fps`, a higher
+    `speed`, or `export.ply`), lanes that blew up, and springs that part, for glTF cannot take a line away.
+    """
+    who = "export.gltf"
+    path = demanded(path, (".glb",))
+    seen = subject(who, film, shown, scene, dims=(2, 3))
+    frames, fps = schedule(who, seen.take, fps, speed)
+    place = _places(who, seen.take, frames)
+    if not isinstance(seen, Bodies):
+        _demand_few(who, place)
+    if isinstance(seen, Lines) and _parts(who, film, seen, scene, frames):
+        raise ValueError(
+            f"{who}: got springs that part, expected ones that hold: glTF cannot take a line away. export.ply writes "
+            "those that hold."
+        )
+    document = Document()
+    times = document.accessor(np.arange(len(frames)) / fps)
+    material = document.material(_rgb(color))
+    if isinstance(seen, Bodies):
+        _add_bodies(document, seen, place, frames, times, material)
+    else:
+        _add_morphing(document, seen, _counted(place, progress), times, material)
+    with replacing(path, "wb") as file:
+        file.write(document.bytes())
+    return path
+
+
+def ply(
+    film: Trajectory,
+    folder: str | os.PathLike,
+    shown: Any = None,
+    *,
+    scene: int | Sequence[int] | None = None,
+    fps: int | float = 30.0,
+    speed: int | float = 1.0,
+    progress: bool = True,
+) -> list[Path]:
+    """Write a run as binary PLY files, `frame_0000.ply` and on, into a new folder, all or none; returns their paths.
+
+    Surfaces and bodies have faces, springs edges (those that hold), dots are points. Numbers are float32 [m]; lanes that
+    blew up are left out, and the time of a frame [s] is in its header. Raises TypeError or ValueError for what does not
+    fit, and an OSError for a folder that cannot be made or is not empty.
+    """
+    who = "export.ply"
+    folder = Path(folder)
+    seen = subject(who, film, shown, scene, dims=(2, 3))
+    seen = seen.surface() if isinstance(seen, Bodies) else seen
+    frames, fps = schedule(who, seen.take, fps, speed)
+    held = unbroken(who, film, seen.springs, batch_index(who, film, scene)) if isinstance(seen, Lines) else None
+    digits = max(4, len(str(len(frames))))
+    names = [f"frame_{number:0{digits}d}.ply" for number in range(len(frames))]
+    with replacing_folder(folder) as inside:
+        for name, frame in _counted(list(zip(names, frames, strict=True)), progress):
+            place = _in_space(seen.take.position[frame])
+            (inside / name).write_bytes(_ply(seen, place, None if held is None else held[frame], seen.take.time[frame]))
+    return [folder / name for name in names]
+
+
+def _add_bodies(document: Document, seen: Bodies, place: np.ndarray, frames: list[int], times: int, look: int) -> None:
+    """A mesh for each different shape, a node for each body."""
+    turn = np.roll(_continuous(seen.orientation[frames]), -1, axis=-1)
+    meshes: dict[bytes, int] = {}
+    for body, shape in enumerate(seen.shapes):
+        same = shape.vertices.tobytes() + shape.faces.tobytes()
+        if same not in meshes:
+            what = {"attributes": {"POSITION": document.vertices(shape.vertices)}, "mode": TRIANGLES, "material": look}
+            meshes[same] = document.mesh(what | {"indices": document.indices(shape.faces)})
+        stands = {"translation": place[0, body].tolist(), "rotation": turn[0, body].tolist()}
+        node = document.node(name=f"body {body}", mesh=meshes[same], **stands)
+        document.animate(node, "translation", times, document.accessor(place[:, body]))
+        document.animate(node, "rotation", times, document.accessor(turn[:, body]))
+
+
+def _add_morphing(document: Document, seen: Any, places: Iterable[np.ndarray], times: int, look: int) -> None:
+    """One mesh that goes from frame to frame: the first is its own shape, each of the others a target of weight 0 or 1."""
+    kinds = {Surface: (TRIANGLES, "faces"), Lines: (LINES, "pairs"), Dots: (POINTS, None)}
+    mode, joined = kinds[type(seen)]
+    first, *others = places
+    what = {"attributes": {"POSITION": document.vertices(first)}, "mode": mode, "material": look}
+    if joined is not None:
+        what["indices"] = document.indices(seen.faces if joined == "faces" else seen.springs.pairs)
+    what["targets"] = [{"POSITION": document.vertices(place - first)} for place in others]
+    node = document.node(name="run", mesh=document.mesh(what, weights=[0.0] * len(others)))
+    weights = np.eye(len(others) + 1)[:, 1:]
+    document.animate(node, "weights", times, document.accessor(weights.ravel()))
+
+
+def _ply(seen: Any, place: np.ndarray, held: np.ndarray | None, time: float) -> bytes:
+    """A frame as a file."""
+    vertices = place.astype("<f4")
+    header = ["ply", "format binary_little_endian 1.0", f"comment t = {time:.9g} s"]
+    tables = []
+    if isinstance(seen, Surface):
+        table = np.empty(len(seen.faces), [("count", "u1"), ("corners", "<i4", (3,))])
+        table["count"], table["corners"] = 3, seen.faces
+        tables = [f"element face {len(table)}", "property list uchar int vertex_indices"]
+    elif isinstance(seen, Lines):
+        pairs = seen.springs.pairs
+        table = np.asarray(pairs if held is None else pairs[held], "<i4")
+        tables = [f"element edge {len(table)}", "property int vertex1", "property int vertex2"]
+    else:
+        vertices, table = vertices[np.isfinite(vertices).all(axis=-1)], np.empty(0)
+    header += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz"), *tables, "end_header"]
+    return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + table.tobytes()
+
+
+def _places(who: str, take: Take, frames: list[int]) -> np.ndarray:
+    """Positions at the frames `(frames, nodes, 3)`, all finite; a ValueError otherwise."""
+    place = _in_space(take.position[frames])
+    lost = ~np.isfinite(place).all(axis=(0, 2))
+    if lost.any():
+        raise ValueError(
+            f"{who}: got {lost.sum()} of {lost.size} lanes that blew up, first {int(np.argmax(lost))}; expected finite "
+            "positions. Leave them out, or write export.ply, which does."
+        )
+    return place
+
+
+def _in_space(position: np.ndarray) -> np.ndarray:
+    """Positions with as many zeros as are missing to three components."""
+    return np.pad(position.astype(float), [(0, 0)] * (position.ndim - 1) + [(0, 3 - position.shape[-1])])
+
+
+def _demand_few(who: str, place: np.ndarray) -> None:
+    """Raise a ValueError for more frames or bytes than a file of morph targets should have."""
+    frames, nodes, _ = place.shape
+    if frames > MOST_SHAPES or 12 * frames * nodes > MOST_BYTES:
+        raise ValueError(
+            f"{who}: got {frames} frames of {nodes} nodes, {12e-6 * frames * nodes:.3g} MB, expected at most {MOST_SHAPES} "
+            f"frames and {MOST_BYTES / 1e6:.0f} MB of what deforms. Choose a lower fps=, a higher speed=, or export.ply."
+        )
+
+
+def _parts(who: str, film: Trajectory, seen: Lines, scene: Any, frames: list[int]) -> bool:
+    held = unbroken(who, film, seen.springs, batch_index(who, film, scene))
+    return held is not None and not held[frames].all()
+
+
+def _continuous(q: np.ndarray) -> np.ndarray:
+    """Quaternions along the first axis, each with the sign that is nearer to the one before it."""
+    turned_back = np.sum(q[1:] * q[:-1], axis=-1) < 0
+    sign = np.cumprod(np.where(turned_back, -1.0, 1.0), axis=0)
+    return np.concatenate([q[:1], q[1:] * sign[..., None]])
+
+
+def _rgb(color: Any) -> tuple[float, float, float]:
+    from matplotlib.colors import to_rgb
+
+    return to_rgb(color)
+
+
+def _counted(items: Any, progress: bool) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(items, desc="writing", unit="frame", disable=not progress, leave=False)

@@ -1,0 +1,97 @@
+"""A glTF 2.0 file in one piece (.glb): arrays in one binary chunk, and the JSON that says what they are.
+
+Metres, seconds and y up, as here; quaternions are (x, y, z, w). Source: the Khronos glTF 2.0 specification.
+"""
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+POINTS, LINES, TRIANGLES = 0, 1, 4
+"""What a primitive is made of."""
+_FLOAT, _UINT = 5126, 5125
+_VERTICES, _INDICES = 34962, 34963
+_WIDTHS = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
+
+
+class Document:
+    """A scene under construction: add meshes, nodes and channels, then take its `.bytes()`."""
+
+    def __init__(self) -> None:
+        self._json: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "physjax"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+        }
+        self._chunks: list[bytes] = []
+        self._channels: list[dict[str, Any]] = []
+        self._samplers: list[dict[str, Any]] = []
+
+    def accessor(self, array: Any, target: int | None = None) -> int:
+        """Enter an array of numbers, vectors or quaternions, as float32, or as uint32 where it is whole; its index."""
+        array = np.asarray(array)
+        whole = np.issubdtype(array.dtype, np.integer)
+        array = np.ascontiguousarray(array, "<u4" if whole else "<f4")
+        rows = array.reshape(len(array), -1)
+        span = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        view = {"buffer": 0, "byteOffset": sum(map(len, self._chunks)), "byteLength": array.nbytes}
+        self._chunks.append(array.tobytes())
+        entry = {"componentType": _UINT if whole else _FLOAT, "count": len(array), "type": _WIDTHS[array.shape[1:]]}
+        where = self._add("bufferViews", view if target is None else view | {"target": target})
+        return self._add("accessors", {"bufferView": where} | entry | span)
+
+    def vertices(self, array: Any) -> int:
+        """Enter what each vertex has."""
+        return self.accessor(array, _VERTICES)
+
+    def indices(self, array: Any) -> int:
+        """Enter the vertices that make triangles or lines."""
+        return self.accessor(np.asarray(array).ravel(), _INDICES)
+
+    def material(self, color: Any) -> int:
+        """A dull material that is seen from both sides; its colour is sRGB, glTF's is linear."""
+        rgb = np.asarray(color, float)
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        look = {"baseColorFactor": [*linear.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
+        return self._add("materials", {"pbrMetallicRoughness": look, "doubleSided": True})
+
+    def mesh(self, primitive: dict[str, Any], **more: Any) -> int:
+        """A mesh of one primitive."""
+        return self._add("meshes", {"primitives": [primitive]} | more)
+
+    def node(self, **what: Any) -> int:
+        """A node of the scene."""
+        node = self._add("nodes", what)
+        self._json["scenes"][0]["nodes"].append(node)
+        return node
+
+    def animate(self, node: int, path: str, times: int, values: int) -> None:
+        """Let a node's translation, rotation or weights go through values at times, straight from one to the next."""
+        self._samplers.append({"input": times, "output": values, "interpolation": "LINEAR"})
+        target = {"node": node, "path": path}
+        self._channels.append({"sampler": len(self._samplers) - 1, "target": target})
+
+    def bytes(self) -> bytes:
+        """The file: a header, the JSON padded with blanks, and the arrays."""
+        binary = b"".join(self._chunks)
+        content = self._json | {"buffers": [{"byteLength": len(binary)}]}
+        if self._channels:
+            content["animations"] = [{"name": "run", "channels": self._channels, "samplers": self._samplers}]
+        text = json.dumps(content, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + len(binary)
+        header = struct.pack("<4sII", b"glTF", 2, size)
+        return (
+            header
+            + struct.pack("<I4s", len(text), b"JSON")
+            + text
+            + struct.pack("<I4s", len(binary), b"BIN\0")
+            + binary
+        )
+
+    def _add(self, kind: str, entry: dict[str, Any]) -> int:
+        entries = self._json.setdefault(kind, [])
+        entries.append(entry)
+        return len(entries) - 1

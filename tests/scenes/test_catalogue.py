@@ -1,0 +1,87 @@
+"""The gallery is listed and drawn from what its scenes are, and a scene that fails stops none of the others."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from physjax import Particles, Scene, forces, lattices
+from physjax.cli import main
+from physjax.scenes import SCENES
+from physjax.scenes.catalogue import entry
+from physjax.study.problem import Problem, Truth
+
+
+def fall() -> Problem:
+    """Three stones that fall side by side in space, without anything in their way."""
+    start = Particles(np.eye(3), np.zeros((3, 3)))
+    still = Truth("keeps to its line [m]", lambda flight: flight.position[-1, :, 0], np.eye(3)[:, 0], 1e-12)
+    return Problem(Scene(start, forces=(forces.Gravity(),)), 0.4, truths=(still,), frames=8)
+
+
+def swing() -> Problem:
+    """A small cloth that swings from its upper edge, drawn as a surface."""
+    sheet = lattices.cloth(0.2, 0.2, 3, 3, mass=0.1, structural=50.0, damping=0.1)
+    scene = Scene(sheet.state, sheet.mass, (forces.Gravity(), sheet.springs), pinned=sheet.nodes["top"])
+    return Problem(scene, 0.2, frames=8, looks=sheet)
+
+
+def ruin() -> Problem:
+    """A scene that cannot be built, to see that nobody minds."""
+    raise RuntimeError("no such bridge")
+
+
+@pytest.fixture
+def gallery(monkeypatch):
+    for name in list(SCENES):
+        monkeypatch.delitem(SCENES, name)
+    for build in (fall, ruin, swing):
+        monkeypatch.setitem(SCENES, build.__name__, build)
+    monkeypatch.setattr("physjax.scenes.catalogue.FRAMES", 16)
+
+
+def test_a_scene_is_told_with_its_size_and_its_truths():
+    told, _ = entry("balls_in_a_box")
+    assert told.size == "64 particles in 2-D, 2 s"
+    assert told.truth.startswith("closed form; every |velocity component| is what it was")
+    told, _ = entry("heavy_top")
+    assert told.size == "2 bodies in 3-D, 1.96 s"
+    told, _ = entry("hanging_rope")
+    assert told.size == "25 particles in 2-D, 24 springs, 4 s"
+    assert "catenary" in str(told)
+    assert max(map(len, str(told).splitlines())) <= 110
+
+
+@pytest.mark.usefixtures("gallery")
+def test_every_scene_is_drawn_and_one_that_fails_is_named_at_the_end(tmp_path, capsys):
+    folder = tmp_path / "gallery"
+    assert main(["scenes", "--render", str(folder)]) == 1
+    told = capsys.readouterr()
+    assert told.err.splitlines()[-1] == "physjax: ruin could not be drawn: RuntimeError: no such bridge"
+    assert "3/3" in told.err
+    expected = {"fall.png", "fall.gif", "swing.png", "swing.gif", "index.html"}
+    assert {file.name for file in folder.iterdir()} == expected
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert "://" not in page
+    assert 'name="viewport"' in page
+    assert all(f'<article id="{name}">' in page for name in SCENES)
+    assert page.count("<img") == 2
+    assert "keeps to its line [m]" in page
+    for name in ("fall", "swing"):
+        with Image.open(folder / f"{name}.gif") as film:
+            assert film.n_frames >= 12  # 16 moments were simulated
+        picture = np.asarray(Image.open(folder / f"{name}.png").convert("RGB")).astype(int)
+        assert (picture.min(axis=(0, 1)) < 120).all()  # drawn on
+        assert (picture == 255).all(axis=-1).mean() < 0.99
+    blue = picture[..., 2] - picture[..., 0] > 60
+    assert blue.mean() > 0.02  # a surface, not lines
+
+
+@pytest.mark.usefixtures("gallery")
+def test_only_some_are_listed_or_drawn(tmp_path, capsys):
+    assert main(["scenes", "--only", "fall"]) == 0
+    printed = capsys.readouterr().out
+    assert "3 particles in 3-D" in printed
+    assert "swing" not in printed
+    assert main(["scenes", "--only", "fal", "--render", str(tmp_path / "out")]) == 2
+    assert "Did you mean fall" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
