@@ -30,6 +30,8 @@ def still(film: Trajectory, looks: Any = None) -> Any:
 
     `looks` is a lattice or shapes, as in `animate.view`; without it the scene says.
     """
+    if _is_born(film):
+        return plot.particles(film, frames=-1)
     kind, looks = _drawn_as(film, looks)
     if kind is Dots:
         return _paths(film)
@@ -38,12 +40,19 @@ def still(film: Trajectory, looks: Any = None) -> Any:
 
 def moving(film: Trajectory, looks: Any = None) -> Film:
     """The same as a short film."""
-    kind, looks = _drawn_as(film, looks)
     duration = float(np.ptp(np.asarray(film.time)))
     pace = {"fps": FPS, "speed": duration / float(np.clip(duration, SHORTEST, LONGEST))}
+    if _is_born(film):
+        return animate.particles(film, **pace)
+    kind, looks = _drawn_as(film, looks)
     if kind is Dots:
         return animate.paths(film, every=_every(film), trail=TRAIL, **pace)
     return _PICTURES[kind][1](film, looks, **pace)
+
+
+def _is_born(film: Trajectory) -> bool:
+    """Whether its particles are born and die, and have a size and a colour of their age."""
+    return film.scene is not None and film.scene.emitter is not None
 
 
 def _drawn_as(film: Trajectory, looks: Any) -> tuple[type, Any]:
