@@ -67,16 +67,16 @@ def _booked_run(run: Any, substeps: Array) -> tuple[Books, Books]:
 def causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
     """Names of the forces, of the contacts, and of the rest: springs that part, what holds, and the method."""
     parting = [
-        f"{name} parted" for name, force in zip(_names(scene.forces), scene.forces, strict=True) if _forgets(force)
+        f"{name} parted" for name, force in zip(named(scene.forces), scene.forces, strict=True) if _forgets(force)
     ]
     holding = [PINS] if scene.pinned is not None else []
     holding += [PIVOTS] if getattr(scene.mass, "arm", None) is not None else []
-    contacts = _names(scene.contacts)
-    return _names(scene.forces), contacts, [*parting, *holding, NUMERICAL]
+    contacts = named(scene.contacts)
+    return named(scene.forces), contacts, [*parting, *holding, NUMERICAL]
 
 
-def _names(parts: tuple) -> list[str]:
-    """What parts are called, numbered where several are called the same."""
+def named(parts: tuple) -> list[str]:
+    """What forces or contacts are called, numbered where several are called the same."""
     names, seen = [force_name(part) for part in parts], Counter()
     several = {name for name, count in Counter(names).items() if count > 1}
     for i, name in enumerate(names):
@@ -115,7 +115,7 @@ def _stock(t: Array, scene: Scene) -> Books:
     """Kinetic energy, every force's potential energy, and both momenta with the sizes that they are measured by."""
     t, state = t.astype(jnp.float64), scene.state
     found = {"kinetic": energy.kinetic(scene, t, state)}
-    for name, force in zip(_names(scene.forces), scene.forces, strict=True):
+    for name, force in zip(named(scene.forces), scene.forces, strict=True):
         if hasattr(force, "potential"):
             found[f"potential of {name}"] = _potential(force, scene, t, state)
     amounts = _amounts(scene, t, state)
@@ -147,13 +147,13 @@ def _step(scene: Scene, method: Any, t: Array, dt: Array, substeps: Array, books
     if scene.led is not None:
         led = scene.led.lead(t + dt, moved)
         books, moved = change(books, NUMERICAL, has(moved), has(led)), led
-    for name, contact in zip(_names(scene.contacts), scene.contacts, strict=True):
+    for name, contact in zip(named(scene.contacts), scene.contacts, strict=True):
         if contact.response is project:
             answered = contact.respond(t + dt, moved)
             books, moved = change(books, name, has(moved), has(answered)), answered
     # held nodes that a contact moved are put back; without pins there is nothing left but rounding
     books = change(books, PINS if scene.pinned is not None else NUMERICAL, has(moved), has(after.state))
-    for i, (name, force) in enumerate(zip(_names(scene.forces), scene.forces, strict=True)):
+    for i, (name, force) in enumerate(zip(named(scene.forces), scene.forces, strict=True)):
         if _forgets(force):
             forces = (*scene.forces[:i], after.forces[i], *scene.forces[i + 1 :])
             books = change(
