@@ -38,11 +38,8 @@ def ablation(result: Any, figure: Any = None) -> Any:
 def _changes(ax: Any, result: Any, places: np.ndarray, colours: list[str]) -> None:
     """Bars of the largest changes in units of what counts; what is zero, or no number, is written out."""
     relative = bool(np.all(result.matters > 0))
-    unit = result.matters if relative else 1.0
-    change, numerical = (
-        np.array([float(np.max(getattr(effect, name) / unit)) for effect in result.effects])
-        for name in ("change", "numerical")
-    )
+    change, numerical, unit = np.array([result.telling(effect) for effect in result.effects]).T
+    change, numerical = (change / unit, numerical / unit) if relative else (change, numerical)
     known = np.concatenate([change, numerical, [1.0]])
     known = known[np.isfinite(known) & (known > 0)]
     low, high = known.min() / 5, known.max() * 5

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import real_quantity
-from physjax.scene import Scene
+from physjax.scene import Scene, project
 from physjax.show.report import seconds_text, table
 from physjax.stepping.simulate import simulate
 from physjax.study.limits import checked_method, name_of
@@ -20,7 +20,7 @@ from physjax.study.removals import Removal, removals, two_at_once
 
 NEEDED, NEGLIGIBLE, COSTLY, NONE = "needed", "negligible", "costs more than it gives", "none"
 SAMPLE, FEWEST, ROUNDS = 0.01, 3, 15
-"""A timing lasts at least so long [s]; at least and at most so many of each."""
+"""A timing is the least of runs that last so long together [s]; at least and at most so many of each."""
 COSTS = 0.1
 """Part of the run's time from which on a part of the model costs something."""
 
@@ -79,7 +79,7 @@ class Ablation(NamedTuple):
             "verdict",
         ]
         rows = [
-            [e.name, _most(e.change), _most(e.numerical), self._saving(e), _count(e.flops), _count(e.bytes), e.verdict]
+            [e.name, *map(_number, self.telling(e)[:2]), self._saving(e), _count(e.flops), _count(e.bytes), e.verdict]
             for e in (self.whole._replace(name="(nothing)"), *self.effects)
         ]
         rows[0][-1] = ""
@@ -88,6 +88,13 @@ class Ablation(NamedTuple):
             f"{self.method}, dt = {seconds_text(self.dt)}; what counts is a change of the outcome by more than {counts}"
         )
         return "\n".join([run, table(headers, rows, align="<>>>>><"), *self.notes])
+
+    def telling(self, effect: Effect) -> tuple[float, float, float]:
+        """Change, numerical error and what counts, for the entry that most exceeds what counts or can be told."""
+        bar = np.maximum(self.matters, effect.numerical)
+        exceeds = np.where(np.isnan(effect.change), np.inf, effect.change) / np.where(bar > 0, bar, 1.0)
+        entry = np.unravel_index(np.argmax(exceeds), exceeds.shape)
+        return tuple(float(numbers[entry]) for numbers in (effect.change, effect.numerical, self.matters))
 
     def _saving(self, effect: Effect) -> str:
         if math.isnan(effect.seconds):
@@ -130,7 +137,7 @@ def ablate(
 
     A part is needed if that changes the outcome by more than `error` times `scale`, the outcome's own size unless given,
     negligible if less; it costs more than it gives if it is negligible and takes a tenth of the time or more; and a change
-    below the numerical error, estimated by a run with half the step, is none. Times are the least of several, all runs
+    below the numerical error, estimated by runs with shorter steps, is none. Times are the least of several, all runs
     in turn, within some `seconds` [s]; a difference within the timer's spread is none, 0 times nothing. Compiles each
     variant twice. Raises ValueError or TypeError for bad input.
     """
@@ -184,16 +191,24 @@ def _run(scene: Scene, method: Callable, dt: float, steps: int, save_every: int)
 def _outcomes(
     outcome: Callable, method: Callable, dt: float, duration: float, save_every: int, removal: Removal
 ) -> tuple[Any, np.ndarray, np.ndarray]:
-    """The run, its outcome, and the outcome's numerical error by Richardson's comparison with half the step.
+    """The run, its outcome, and the outcome's numerical error by Richardson's comparison with shorter steps.
 
-    Twice the difference is the error at first order, more than it at any other; below it is rounding.
+    Twice the difference to half the step is the error at first order, more than it at any other; below it is rounding.
+    What is answered at the end of a step may happen to be answered at the same moment in half the step: there the run is
+    also compared with one whose steps end elsewhere.
     """
-    flight = simulate(removal.scene, method, dt=dt, duration=duration, save_every=save_every)
-    finer = simulate(removal.scene, method, dt=dt / 2, steps=2 * flight.steps, save_every=2 * save_every)
-    seen = [eqx.tree_at(lambda run: run.state, one, removal.whole(one.state)) for one in (flight, finer)]
-    value, better = (np.asarray(outcome(one), float) for one in seen)
+    scene = removal.scene
+    late = any(contact.response is project for contact in scene.contacts) or any(
+        hasattr(force, "advance") for force in scene.forces
+    )
+    flight = simulate(scene, method, dt=dt, duration=duration, save_every=save_every)
+    frames, values = flight.steps // save_every, []
+    for every in (save_every, 2 * save_every, *([2 * save_every + 1] if late else [])):
+        one = simulate(scene, method, dt=dt * save_every / every, steps=frames * every, save_every=every)
+        values.append(np.asarray(outcome(eqx.tree_at(lambda run: run.state, one, removal.whole(one.state))), float))
+    value = values[0]
     rounding = float(jnp.finfo(flight.position.dtype).eps) * math.sqrt(flight.steps) * np.abs(value)
-    return flight, value, 2 * np.abs(value - better) + rounding
+    return flight, value, 2 * np.max([np.abs(value - better) for better in values[1:]], axis=0) + rounding
 
 
 def _times(runs: list[Callable], seconds: float) -> list[tuple[float, float]]:
@@ -203,17 +218,18 @@ def _times(runs: list[Callable], seconds: float) -> list[tuple[float, float]]:
     counts = []
     for run in runs:
         run()
-        started = time.perf_counter()
-        run()
-        counts.append(max(1, math.ceil(SAMPLE / (time.perf_counter() - started))))
+        counts.append(max(1, math.ceil(SAMPLE / _seconds(run))))
     taken, begun = [[] for _ in runs], time.perf_counter()
     while len(taken[0]) < FEWEST or (len(taken[0]) < ROUNDS and time.perf_counter() - begun < seconds):
         for run, count, times in zip(runs, counts, taken, strict=True):
-            started = time.perf_counter()
-            for _ in range(count):
-                run()
-            times.append((time.perf_counter() - started) / count)
+            times.append(min(_seconds(run) for _ in range(count)))
     return [(min(times), float(np.quantile(times, 0.25)) - min(times)) for times in taken]
+
+
+def _seconds(run: Callable) -> float:
+    started = time.perf_counter()
+    run()
+    return time.perf_counter() - started
 
 
 def _cost(scene: Scene, method: Callable, dt: float) -> tuple[float, float]:
@@ -224,9 +240,8 @@ def _cost(scene: Scene, method: Callable, dt: float) -> tuple[float, float]:
     return float(counted.get("flops", math.nan)), float(counted.get("bytes accessed", math.nan))
 
 
-def _most(amounts: np.ndarray) -> str:
-    """The largest entry."""
-    return f"{float(np.max(amounts)):.3g}"
+def _number(amount: float) -> str:
+    return f"{amount:.3g}"
 
 
 def _count(number: float) -> str:

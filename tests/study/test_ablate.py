@@ -100,7 +100,7 @@ def test_bend_springs_in_a_taut_rope_pull_it_straight_as_the_dispersion_says():
 
 def test_the_third_dimension_goes_where_nothing_needs_it():
     ball = Particles(jnp.asarray([0.0, 1.0, 0.5]), jnp.asarray([3.0, 4.0, 0.0]))
-    spin = forces.Magnus(4.3e-3, 0.2, (0.0, 0.0, 3.0))
+    spin = forces.Magnus(4.3e-3, 3.0, (0.0, 0.0, 3.0))
     floor = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.7, friction=0.2, response=contacts.project)
     parts = (forces.Gravity(), forces.QuadraticDrag(4.3e-3, 0.4, wind=(-2.0, 0.0, 0.0)), spin)
     run = {"method": methods.rk4, "dt": 0.01, "duration": 1.5, "save_every": 50, **UNTIMED}
