@@ -162,19 +162,27 @@ def ablate(
     progress("times")
     times = _times([partial(_run, s, method, step, flight.steps, save_every) for s in scenes], seconds)
     matters = np.broadcast_to(error * np.abs(value if scale is None else np.asarray(scale, float)), value.shape)
-    effects = []
-    for name, one, (now, off), clock in zip(
-        ("everything", *(removal.name for removal in found)), scenes, measured, times, strict=True
-    ):
-        if now.shape != value.shape:
-            raise ValueError(f"outcome: got the shape {now.shape} without {name}, expected {value.shape} as with it.")
-        numerical, change = np.maximum(off, uncertain), np.abs(now - value)
-        (least, spread), saved = clock, times[0][0] - clock[0]
-        spread = max(spread, times[0][1])
-        saved = saved if abs(saved) > spread else 0.0
-        verdicts = _verdicts(change, numerical, matters, saved > COSTS * times[0][0])
-        effects.append(Effect(name, now, change, numerical, least, saved, spread, *_cost(one, method, step), verdicts))
+    names = ["everything", *(removal.name for removal in found)]
+    costs = [_cost(one, method, step) for one in scenes]
+    effects = [
+        _effect(*each, whole=measured[0], clock=times[0], matters=matters)
+        for each in zip(names, measured, times, costs, strict=True)
+    ]
     return Ablation(effects[0], tuple(effects[1:]), matters, name_of(method), step, tuple(notes))
+
+
+def _effect(
+    name: str, measured: tuple, timed: tuple, cost: tuple, *, whole: tuple, clock: tuple, matters: np.ndarray
+) -> Effect:
+    """What leaving out did: outcome and its error, time and its spread, beside those of the whole."""
+    (now, off), (value, uncertain) = measured, whole
+    if now.shape != value.shape:
+        raise ValueError(f"outcome: got the shape {now.shape} without {name}, expected {value.shape} as with it.")
+    numerical, change = np.maximum(off, uncertain), np.abs(now - value)
+    saved, spread = clock[0] - timed[0], max(timed[1], clock[1])
+    saved = saved if abs(saved) > spread else 0.0
+    verdicts = _verdicts(change, numerical, matters, saved > COSTS * clock[0])
+    return Effect(name, now, change, numerical, timed[0], saved, spread, *cost, verdicts)
 
 
 def _verdicts(change: np.ndarray, numerical: np.ndarray, matters: np.ndarray, costs: bool) -> np.ndarray:
@@ -202,13 +210,13 @@ def _outcomes(
         hasattr(force, "advance") for force in scene.forces
     )
     flight = simulate(scene, method, dt=dt, duration=duration, save_every=save_every)
-    frames, values = flight.steps // save_every, []
-    for every in (save_every, 2 * save_every, *([2 * save_every + 1] if late else [])):
-        one = simulate(scene, method, dt=dt * save_every / every, steps=frames * every, save_every=every)
-        values.append(np.asarray(outcome(eqx.tree_at(lambda run: run.state, one, removal.whole(one.state))), float))
-    value = values[0]
+    frames, runs = flight.steps // save_every, [flight]
+    for every in (2 * save_every, *([2 * save_every + 1] if late else [])):
+        runs.append(simulate(scene, method, dt=dt * save_every / every, steps=frames * every, save_every=every))
+    seen = [eqx.tree_at(lambda run: run.state, one, removal.whole(one.state)) for one in runs]
+    value, *finer = (np.asarray(outcome(one), float) for one in seen)
     rounding = float(jnp.finfo(flight.position.dtype).eps) * math.sqrt(flight.steps) * np.abs(value)
-    return flight, value, 2 * np.max([np.abs(value - better) for better in values[1:]], axis=0) + rounding
+    return flight, value, 2 * np.max([np.abs(value - better) for better in finer], axis=0) + rounding
 
 
 def _times(runs: list[Callable], seconds: float) -> list[tuple[float, float]]:
