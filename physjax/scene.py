@@ -250,7 +250,7 @@ class Scene(eqx.Module):
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
-        motion = partial(_free_motion, method)
+        motion = partial(free_motion, method)
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
@@ -287,7 +287,7 @@ class Scene(eqx.Module):
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
 
 
-def _free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+def free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """A step of the method as if nothing were in the way."""
     return scene.having(state=scene.settled(method(scene.during(t, dt), t, scene.state, dt)))
 

@@ -89,9 +89,9 @@ def _through_touches(
     motion: Callable, changing: tuple[Particles, tuple], meets: Array, scene: Scene, t: ArrayLike, dt: ArrayLike
 ) -> tuple[Particles, tuple]:
     """The step again, leg by leg from touch to touch, of lanes that may meet something; the others are where they arrived."""
-    walls, dt = _walls(scene), jnp.broadcast_to(dt, scene.state.lanes)
-    begun = scene.state, tuple(wall.touching_since for wall in walls)
-    leg = _Leg(jnp.zeros_like(dt), *_where(meets, begun, changing), ~meets)
+    leg, dt = _beginning(scene, dt)
+    state, since = _where(meets, (leg.state, leg.since), changing)
+    leg = leg._replace(state=state, since=since, arrived=~meets)
 
     def go_on(leg, _):
         more = any_lane(~leg.arrived)
@@ -101,12 +101,25 @@ def _through_touches(
     return leg.state, leg.since
 
 
+def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
+    """Where the first leg of a step begins, and the step of each lane."""
+    dt = jnp.broadcast_to(dt, scene.state.lanes)
+    since = tuple(wall.touching_since for wall in _walls(scene))
+    return _Leg(jnp.zeros_like(dt), scene.state, since, jnp.zeros(dt.shape, bool)), dt
+
+
+def _begun(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> tuple[Array, Array, Held]:
+    """When a leg begins, how much of the step is left, and what carries each lane through it."""
+    walls, begun, rest = _walls(scene), t + leg.elapsed, jnp.maximum(dt - leg.elapsed, _hair(dt))
+    here = scene.having(state=leg.state)
+    start = apart(~leg.arrived, lambda: hold(here, walls, leg.since, begun, rest), nothing_held(here, walls, leg.since))
+    return begun, rest, start
+
+
 def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> _Leg:
     """From where the lanes are to the first touch of each, or to the end of the step."""
-    walls, begun, rest = _walls(scene), t + leg.elapsed, jnp.maximum(dt - leg.elapsed, _hair(dt))
-    going = ~leg.arrived
-    here = scene.having(state=leg.state)
-    start = apart(going, lambda: hold(here, walls, leg.since, begun, rest), nothing_held(here, walls, leg.since))
+    walls, going = _walls(scene), ~leg.arrived
+    begun, rest, start = _begun(scene, leg, t, dt)
     held = carried(scene, walls, start)
     end = apart(going, lambda: motion(held, begun, rest).state, leg.state)
     meeting = apart(going, lambda: _next_meeting(scene, start, end, begun, rest))
@@ -122,6 +135,45 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> 
         return _where(meeting.hit, _Leg(leg.elapsed + duration, state, since, leg.arrived), through)
 
     return lax.cond(any_lane(meeting.hit), touch, lambda: through)
+
+
+class Flight(NamedTuple):
+    """A leg of a step, from one touch to the next, as it was flown.
+
+    `before` is the state that the touch before it left, `scene` begins with what the surfaces made of that and carries
+    their reactions; `begun` [s] and `duration` [s] are of each lane; `end` is where the method came, `after` what the
+    touch there made of it. Lanes that are not `flying` had arrived before.
+    """
+
+    before: Particles
+    scene: Scene
+    begun: Array
+    duration: Array
+    end: Particles
+    after: Particles
+    flying: Bool[Array, "*lanes"]
+
+
+def flights(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Callable, total: Any) -> Any:
+    """The legs of the step that `impact` takes, told one by one: `total = add(total, flight)`, folded over them.
+
+    Returns the total and the state after the step.
+    """
+    leg, dt = _beginning(scene, dt)
+
+    def fly(leg, total):
+        begun, _, start = _begun(scene, leg, t, dt)
+        held = carried(scene, _walls(scene), start)
+        after = _where(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
+        duration = jnp.maximum(after.elapsed - leg.elapsed, _hair(dt))
+        end = motion(held, begun, duration).state
+        return after, add(total, Flight(leg.state, held, begun, duration, end, after.state, ~leg.arrived))
+
+    def go_on(carry, _):
+        return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
+
+    (leg, total), _ = lax.scan(go_on, (leg, total), length=IMPACTS + 1)
+    return total, leg.state
 
 
 def _hair(dt: Array) -> Array:

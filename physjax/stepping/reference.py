@@ -110,9 +110,9 @@ def default_solver() -> Any:
     return diffrax.Dopri8()
 
 
-def in_dtype(scene: Scene, dtype: Any) -> Scene:
-    """The scene with all its floating-point arrays in another dtype; call it inside `jax.enable_x64(True)` for float64."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, scene)
+def in_dtype(tree: Any, dtype: Any) -> Any:
+    """A scene (or state) with all its floating-point arrays in another dtype; for float64 inside `jax.enable_x64(True)`."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 @eqx.filter_jit

@@ -23,6 +23,7 @@ from physjax.show.report import seconds_text
 from physjax.stepping.methods import METHODS, rk4
 from physjax.stepping.reference import default_solver, in_dtype, reference, solve_ode
 from physjax.stepping.simulate import sample
+from physjax.study.ablate import ablate as ablate
 from physjax.study.energy import Conserved
 from physjax.study.problem import Problem
 from physjax.study.work_precision import Run, WorkPrecision

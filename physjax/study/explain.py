@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.particles import Particles, demand_particles
@@ -13,6 +14,7 @@ from physjax.show.report import seconds_text
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
+from physjax.study.lane_parts import one_lane
 from physjax.study.limits import Limit, growth, limit
 from physjax.study.small_motion import rate_text
 from physjax.trajectory import Trajectory
@@ -64,12 +66,21 @@ class Explanation(NamedTuple):
 
 
 def explain(
-    run: Trajectory | Scene, method: Callable | None = None, dt: float | None = None, *, steps: int = 1200
+    run: Trajectory | Scene,
+    method: Callable | None = None,
+    dt: ArrayLike | None = None,
+    *,
+    steps: int = 1200,
+    lane: int | tuple[int, ...] | None = None,
 ) -> Explanation:
     """Why a run blew up or went astray: where, the force and the eigenvalue responsible, the limit broken, two cures.
 
-    Give a trajectory, or a scene with a method and a dt [s], which is then run for `steps`. Print the result.
+    Give a trajectory, or a scene with a method and a dt [s], which is then run for `steps`. Print the result. Of many lanes
+    the first that failed is told, or the given `lane` alone (of coupled ones a scene), as if it were run by itself:
+    `explain(flight, lane=int(jnp.argmin(flight.ok)))`.
     """
+    if lane is not None:
+        return explain(_alone(run, method, dt, steps, lane))
     if isinstance(run, Scene):
         if method is None or dt is None:
             raise ValueError("explain: got a scene alone, expected its method and dt as well.")
@@ -111,6 +122,23 @@ def explain(
             cause="resolution", force=fastest.force, rate=fastest.rate, t=t, limit=fastest.dt, cures=cures
         )
     return plain
+
+
+def _alone(
+    run: Trajectory | Scene, method: Callable | None, dt: ArrayLike | None, steps: int, lane: int | tuple[int, ...]
+) -> Trajectory:
+    """One lane of a run, run again by itself."""
+    every, first_step = max(1, steps // MOMENTS), 0
+    if isinstance(run, Trajectory):
+        method, dt, steps, every, first_step = run.method, run.dt, run.steps, run.save_every, run.first_step
+        run = run.scene
+    if not isinstance(run, Scene) or method is None or dt is None:
+        raise TypeError(
+            "explain: expected a Trajectory that knows its scene and method, or a Scene with method and dt."
+        )
+    step = np.asarray(dt)[lane] if np.ndim(dt) else dt
+    scene = one_lane(run, lane)
+    return simulate(scene, method, dt=step, steps=steps // every * every, save_every=every, first_step=first_step)
 
 
 def _where(run: Trajectory) -> tuple[int, tuple[int, ...]]:

@@ -250,10 +250,10 @@ def _blamed(scene: Scene, state: Particles, motion: SmallMotion, block: tuple, m
     size = np.sum(np.abs(moved) ** 2, axis=-1)
     node = tuple(int(i) for i in np.unravel_index(np.argmax(size), size.shape))
     spring = _worst_spring(force, state, moved, kind, block) if isinstance(force, Springs) else None
-    return ("stiffness", "damping")[kind], _force_name(force), spring, node, complex(rate)
+    return ("stiffness", "damping")[kind], force_name(force), spring, node, complex(rate)
 
 
-def _force_name(force: Any) -> str:
+def force_name(force: Any) -> str:
     """What a force is called in sentences: its class, or the name of the function that it is."""
     return getattr(getattr(force, "function", force), "__name__", type(force).__name__)
 

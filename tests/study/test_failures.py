@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import methods, simulate, stability
+from physjax import Particles, Scene, forces, methods, simulate, stability
 from physjax.scenes import FAILURES, title
 from physjax.scenes.failures import OMEGA
 
@@ -90,3 +90,21 @@ def test_a_sound_run_is_not_accused():
     assert "Nothing was found wrong" in str(told)
     with pytest.raises(ValueError, match="its method and dt"):
         stability.explain(FAILURES["euler_on_a_spring"]().scene)
+
+
+def test_one_failed_lane_of_many_is_told_by_itself():
+    stiffness = np.array([1.0, 9.0, 4.0e4])
+    lanes = Particles(jnp.ones((3, 3)), jnp.zeros((3, 3)))
+    springs = forces.Anchor((0.0, 0.0, 0.0), stiffness)  # as many lanes as components: the point is one for all
+    wind = forces.StokesDrag(1e-6, wind=(1.0, 0.0, 0.0))
+    flight = simulate(Scene(lanes, 1.0, (springs, wind)), methods.verlet, dt=0.02, steps=600, save_every=50)
+    assert flight.ok.tolist() == [True, True, False]
+    failed = int(np.argmin(flight.ok))
+    told = stability.explain(flight, lane=failed)
+    assert (told.cause, told.force) == ("stiffness", "Anchor")
+    assert told.first_bad_step == flight.first_bad_step[failed]
+    assert told.limit == pytest.approx(2 / np.sqrt(stiffness[failed]), rel=1e-3)
+    assert stability.explain(flight.scene, methods.verlet, 0.02, steps=600, lane=failed).cause == "stiffness"
+    assert stability.explain(flight, lane=0).cause == "nothing"
+    with pytest.raises(IndexError, match="whose shape is"):
+        stability.explain(flight, lane=3)
