@@ -240,7 +240,7 @@ print(*(name for name in sys.modules if name.startswith("physjax.physics.")))
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT.parent)
     assert run.stdout.split()
-    theirs = {"bodies", "collide", "hulls", "impulses", "inertia", "rigid"}
+    theirs = {"balls", "bodies", "collide", "hulls", "impulses", "inertia", "joints", "rigid"}
     assert not theirs & {name.rpartition(".")[2] for name in run.stdout.split()}
 
 

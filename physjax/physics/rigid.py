@@ -7,7 +7,7 @@
 
 Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
 inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
-`Hull`; `contacts=(Touch(hull, surface),)` say what it may not pass.
+`Hull`; `contacts=(Touch(hull, surface), Balls(radius))` say what it may not pass.
 """
 
 from collections.abc import Callable
@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from physjax.checks import quantity, real_quantity
 from physjax.particles import Particles
+from physjax.physics.balls import Balls
 from physjax.physics.bodies import Load, OnBodies, RigidBodies, Wrench, angular_acceleration, angular_velocity, in_world
 from physjax.physics.hulls import Hull, Touch
 from physjax.physics.inertia import Inertia, real_turn
@@ -28,6 +29,7 @@ from physjax.vectors import cross, over, scale, turn, turn_back
 
 __all__ = [
     "AtPoint",
+    "Balls",
     "Hull",
     "Load",
     "RigidBodies",
