@@ -24,7 +24,7 @@ def test_a_free_chain_keeps_momentum_angular_momentum_and_energy():
     rng = np.random.default_rng(0)
     scene, joints = chain(velocity=rng.normal(size=(4, 3)), angular_velocity=rng.normal(size=(4, 3)))
     assert scene.couples
-    film = simulate(scene, methods.rk4, dt=2e-4, steps=2000, save_every=100)
+    film = simulate(scene, methods.rk4, dt=1e-4, steps=4000, save_every=200)
     for quantity, off in ((energy.MOMENTUM, 1e-13), (energy.ANGULAR_MOMENTUM, 1e-8), (energy.ENERGY, 1e-5)):
         told = np.asarray(jax.vmap(lambda t, s, q=quantity: q.value(scene, t, s))(film.time, film.state))
         assert np.abs(told - told[:1]).max() < off * float(quantity.size(scene, 0.0, scene.state)), quantity.name
