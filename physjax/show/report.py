@@ -26,7 +26,7 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str |
 def seconds_text(seconds: int | float) -> str:
     """A time with a unit that keeps it readable, from µs to days."""
     for unit, size in (("d", 86400.0), ("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
+        if float(f"{seconds / size:.3g}") >= 1:  # as it is printed
             return f"{seconds / size:.3g} {unit}"
     return f"{seconds / 1e-6:.3g} µs"
 
