@@ -22,6 +22,11 @@ class Particles(NamedTuple):
 
     The record knows how Newton's law moves it, so that the methods need no physics: `rate` is its time derivative,
     `kick` changes the velocity and leaves the position, `drift` moves the position with the velocity it has.
+
+    Example:
+        >>> balls = Particles(position=jnp.zeros((10_000, 3)), velocity=jnp.ones((10_000, 3)))
+        >>> balls.lanes
+        (10000,)
     """
 
     position: Float[Array, "*lanes dim"]

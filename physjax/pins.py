@@ -26,6 +26,12 @@ class Pins(eqx.Module):
     scalar, or shaped to broadcast with the lanes where a run has many step sizes. Numbers of a path that is an
     `equinox.Module` can be swept and differentiated; a plain function compiles anew for each new one. Led lanes must
     start on the path: `state = pins.lead(0.0, state)`. Raises ValueError or TypeError otherwise.
+
+    Example:
+        >>> hand = Pins(sheet.nodes["left"], path=lambda t: sheet.state.position + jnp.array([0.0, 2.0, 0.0]) * t)
+        >>> led = hand.lead(0.5, sheet.state)
+        >>> print(led.position[0], led.velocity[0])
+        [0. 1. 0.] [0. 2. 0.]
     """
 
     nodes: Bool[Array, "*lanes"]

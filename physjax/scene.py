@@ -31,6 +31,13 @@ class Force(eqx.Module):
     lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
     One that jumps in time has `during(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
     `near(t, state, mass) -> force` is its tangent for implicit steps; one that is `definite` always pushes back.
+
+    Example:
+        >>> class Engine(Force):
+        ...     def __call__(self, t, state, mass):
+        ...         return 2.0 * state.velocity
+        >>> print(loads(Scene(ball, forces=(Engine(),)), 0.0))
+        [6. 8.]
     """
 
     couples: ClassVar[bool] = False
@@ -41,7 +48,15 @@ class Force(eqx.Module):
 
 
 class Field(Force):
-    """A force proportional to mass, given as an acceleration [m/s²], so that a falling body never looks its mass up."""
+    """A force proportional to mass, given as an acceleration [m/s²], so that a falling body never looks its mass up.
+
+    Example:
+        >>> class Tide(Field):
+        ...     def acceleration(self, t, state, mass):
+        ...         return 0.5 * state.position
+        >>> print(Tide()(0.0, ball, shot.mass))
+        [ 0. 10.]
+    """
 
     @abstractmethod
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
@@ -57,6 +72,11 @@ class Contact(eqx.Module):
 
     A `response(motion, scene, t, dt) -> scene` other than `project` decides otherwise when touches are answered;
     `memory` names the arrays that it changes.
+
+    Example:
+        >>> floor = contacts.Plane(point=(0.0, 0.0), normal=(0.0, 1.0))
+        >>> isinstance(floor, Contact), float(floor.gap(0.0, ball.position))
+        (True, 10.0)
     """
 
     couples: ClassVar[bool] = False
@@ -105,6 +125,13 @@ def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "S
 
     Cheap and robust, first order in dt: a bounce happens at the end of the step, not when the surface was met, and a
     lane that crosses a thin obstacle within one step is not seen.
+
+    Example:
+        >>> low = Particles(jnp.array([0.0, -0.1]), jnp.array([3.0, -4.0]))
+        >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.project)
+        >>> after = floor.respond(0.0, low)
+        >>> print(after.position, after.velocity)
+        [0. 0.] [3. 2.]
     """
     scene = motion(scene, t, dt)
     state = scene.state
@@ -133,6 +160,11 @@ class Scene(eqx.Module):
     leads them. With an `emitter` the lanes are born and die. Every number becomes an array of the state's dtype:
     changing it compiles nothing, and it can be swept and differentiated. Raises ValueError or TypeError for shapes that
     do not match, numbers that are not finite, and masses <= 0.
+
+    Example:
+        >>> scene = Scene(ball, mass=0.5, forces=(forces.Gravity(), forces.StokesDrag(0.5)))
+        >>> print(scene.acceleration(0.0, scene.state))
+        [ -3.  -13.8]
     """
 
     state: Any
@@ -309,6 +341,10 @@ def loads(scene: Scene, t: ArrayLike, state: Any = None, *, per_term: bool = Fal
 
     Returns an array shaped like the velocity, for rigid bodies a `Wrench` of force [N] and torque about the centre of
     mass [N m]; with `per_term=True` a tuple of such, one for each of `scene.forces`.
+
+    Example:
+        >>> print(loads(Scene(ball, mass=2.0, forces=(forces.Gravity(), forces.Constant((5.0, 20.0)))), 0.0))
+        [5.  0.4]
     """
     state = scene.state if state is None else state
     terms = tuple(state.load(force, t, scene.mass) for force in scene.forces)

@@ -27,6 +27,10 @@ class Trajectory(eqx.Module):
     did not. `.parts` are the forces, contacts and emitter that remember, with the arrays they changed at every frame.
     `.recorded` replaces `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of
     the run, from which it can be resumed.
+
+    Example:
+        >>> flight
+        <Trajectory: verlet, 21 frames from t = 0 to 2 s, position (21, 2) float32, ok>
     """
 
     time: Float[Array | np.ndarray, "frames *lanes"]
@@ -44,23 +48,44 @@ class Trajectory(eqx.Module):
 
     @property
     def position(self) -> Float[Array | np.ndarray, "frames *lanes dim"]:
-        """Positions [m] at the frames."""
+        """Positions [m] at the frames.
+
+        Example:
+            >>> print(flight.position[10])
+            [3.  9.1]
+        """
         return self._states().position
 
     @property
     def velocity(self) -> Float[Array | np.ndarray, "frames *lanes dim"]:
-        """Velocities [m/s] at the frames; of rigid bodies those of their centres of mass."""
+        """Velocities [m/s] at the frames; of rigid bodies those of their centres of mass.
+
+        Example:
+            >>> print(flight.velocity[10])
+            [ 3.  -5.8]
+        """
         states = self._states()
         return states.velocity if hasattr(states, "velocity") else states.shown_to(None, self.scene.mass)[0].velocity
 
     @property
     def method(self) -> Any:
-        """The method that made the run; None when it came from a reference solver."""
+        """The method that made the run; None when it came from a reference solver.
+
+        Example:
+            >>> flight.method is methods.verlet
+            True
+        """
         return self.stepper.function if isinstance(self.stepper, Function) else self.stepper
 
     @property
     def final_step(self) -> Int[Array | np.ndarray, ""]:
-        """The count of steps at the end, to resume from."""
+        """The count of steps at the end, to resume from.
+
+        Example:
+            >>> rest = simulate(flight.final_scene, methods.verlet, dt=0.1, steps=20, first_step=flight.final_step)
+            >>> int(rest.final_step)
+            40
+        """
         return self.first_step + self.steps
 
     @property
@@ -69,6 +94,10 @@ class Trajectory(eqx.Module):
 
         Watching every step would slow every run, so a run that failed is stepped once more, with a watch, when this is
         read.
+
+        Example:
+            >>> int(flight.first_bad_step)
+            -1
         """
         ok = concrete(self.ok)
         if ok is not None and ok.all():
@@ -81,7 +110,12 @@ class Trajectory(eqx.Module):
 
     @property
     def film(self) -> Scene:
-        """The scene with frames along a leading axis in each array that changed: its state, and what parts remember."""
+        """The scene with frames along a leading axis in each array that changed: its state, and what parts remember.
+
+        Example:
+            >>> flight.film.state.position.shape
+            (21, 2)
+        """
         return _remembering(self._known_scene("film"), self._states(), self.parts)
 
     def __repr__(self) -> str:
@@ -108,6 +142,11 @@ class Trajectory(eqx.Module):
         its return within one step are not seen, nor are those between two frames whose positions and velocities, by the
         cubic through them, do not tell of it. Coupled nodes have their own moments each, at the cost of a few steps of
         the whole scene for every node. Raises ValueError where the run does not know its scene and method.
+
+        Example:
+            >>> landing = flight.crossing(0.0, direction=-1)
+            >>> round(float(landing.time), 3), round((4.0 + (4.0**2 + 2 * 9.8 * 10.0) ** 0.5) / 9.8, 3)
+            (1.894, 1.894)
         """
         self._known_scene("crossing")
         return first_crossing(self, surface, direction)
@@ -117,6 +156,11 @@ class Trajectory(eqx.Module):
 
         Holds time, ok, first_bad_step, dt, steps, save_every, the name of the method, and the arrays of state, parts
         and recorded, named after their fields. The scene itself is code and stays with you.
+
+        Example:
+            >>> flight.save("flight.npz")
+            >>> np.load("flight.npz")["time"].shape
+            (21,)
         """
         arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
         arrays["method"] = getattr(self.method, "__name__", type(self.method).__name__)
@@ -137,6 +181,12 @@ class Trajectory(eqx.Module):
         Without them frames and status are there all the same. What was recorded comes back as an array, or, if it was
         more than one, as a dict by path. Raises FileNotFoundError, or ValueError for a file that is not a saved run or
         belongs to another scene.
+
+        Example:
+            >>> flight.save("flight.npz")
+            >>> again = Trajectory.load("flight.npz", scene=shot, method=methods.verlet)
+            >>> bool((again.position == flight.position).all())
+            True
         """
         file = Path(path)
         if not file.is_file():

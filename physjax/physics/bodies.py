@@ -35,14 +35,25 @@ from physjax.vectors import (
 
 
 class Wrench(NamedTuple):
-    """A force [N] and a torque about the centre of mass [N m], in the world's frame; None where there is none."""
+    """A force [N] and a torque about the centre of mass [N m], in the world's frame; None where there is none.
+
+    Example:
+        >>> push = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(force=2.0 * bodies.momentum))
+        >>> print(loads(Scene(body, brick, (push,)), 0.0).force)
+        [24.  0.  0.]
+    """
 
     force: Float[Array, "*lanes 3"] | None = None
     torque: Float[Array, "*lanes 3"] | None = None
 
 
 class Load(Force):
-    """What acts on bodies as bodies: `(t, bodies, inertia) -> Wrench`. Other forces act at the centre of mass."""
+    """What acts on bodies as bodies: `(t, bodies, inertia) -> Wrench`. Other forces act at the centre of mass.
+
+    Example:
+        >>> isinstance(rigid.Torque((0.0, 0.0, 1.0)), rigid.Load)
+        True
+    """
 
     @abstractmethod
     def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
@@ -79,6 +90,10 @@ class RigidBodies(NamedTuple):
     Shapes `(*lanes, 3)`, the orientation's `(*lanes, 4)`; momentum [kg m/s] and angular momentum [kg m²/s] about the
     centre of mass, or, for a body on a pivot, about that. `bodies` builds them from velocities. A scene of them has an
     `Inertia` for its mass. The orientation is brought to length 1.
+
+    Example:
+        >>> isinstance(body, RigidBodies), body.momentum.tolist(), body.angular_momentum.tolist()
+        (True, [12.0, 0.0, 0.0], [0.0, 0.0, 10.0])
     """
 
     position: Float[Array, "*lanes 3"]
@@ -233,14 +248,24 @@ def in_world(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]
 
 
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
-    """ω = R I⁻¹ Rᵀ L [rad/s], in the world's frame."""
+    """ω = R I⁻¹ Rᵀ L [rad/s], in the world's frame.
+
+    Example:
+        >>> print(rigid.angular_velocity(body, brick))
+        [0. 0. 2.]
+    """
     return answer(bodies, inertia, bodies.angular_momentum)
 
 
 def angular_acceleration(
     bodies: RigidBodies, inertia: Inertia, torque: Float[Array, "*lanes 3"]
 ) -> Float[Array, "*lanes 3"]:
-    """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world's frame; the torque [N m] about the centre of mass, or the pivot."""
+    """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world's frame; the torque [N m] about the centre of mass, or the pivot.
+
+    Example:
+        >>> print(rigid.angular_acceleration(body, brick, torque=jnp.array([0.0, 0.0, 10.0])))
+        [0. 0. 2.]
+    """
     gyroscopic = cross(angular_velocity(bodies, inertia), bodies.angular_momentum)
     return answer(bodies, inertia, torque - gyroscopic)
 

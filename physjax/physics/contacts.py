@@ -29,6 +29,11 @@ class Surface(Contact):
     `restitution` is 1 for a perfect bounce, 0 for none. `friction` is the lecture's K_f, the fraction of the tangential
     velocity that a bounce takes; `coulomb` clamps the tangential impulse by the normal one instead. (K_r = 0 sticks
     only with K_f = 1 as well, and gravity acts again in the next step: the lecture's "stick to wall" is for a moment.)
+
+    Example:
+        >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, friction=0.25)
+        >>> print(floor.respond(0.0, Particles(jnp.array([0.0, -0.1]), jnp.array([4.0, -4.0]))).velocity)
+        [3. 2.]
     """
 
     restitution: Float[Array, "..."] = quantity("restitution K_r", "1", at_least=0, default=1.0, kw_only=True)
@@ -149,7 +154,13 @@ _TINY = 1e-30
 
 
 class Plane(Surface):
-    """A floor, a wall, a slope: legal is (X - P)·N > 0. The normal N is made a unit vector."""
+    """A floor, a wall, a slope: legal is (X - P)·N > 0. The normal N is made a unit vector.
+
+    Example:
+        >>> slope = contacts.Plane(point=(0.0, 5.0), normal=(3.0, 4.0))
+        >>> round(float(slope.gap(0.0, ball.position)), 3)
+        4.0
+    """
 
     point: Float[Array, "..."] = quantity("point of the plane", "m")
     normal: Float[Array, "..."] = quantity("normal of the plane", "1")
@@ -170,6 +181,10 @@ class Slab(Surface):
     """A plate of finite thickness [m] with two legal sides, about the plane through a point.
 
     With `inside=True` it is a corridor of that width: legal is what lies between its faces.
+
+    Example:
+        >>> float(contacts.Slab((0.0, 0.0), (0.0, 1.0), thickness=2.0).gap(0.0, ball.position))
+        9.0
     """
 
     point: Float[Array, "..."] = quantity("point in the middle of the slab", "m")
@@ -209,7 +224,12 @@ class Slab(Surface):
 
 
 class Sphere(Surface):
-    """A ball in the way, or with `inside=True` a bowl that keeps what it holds."""
+    """A ball in the way, or with `inside=True` a bowl that keeps what it holds.
+
+    Example:
+        >>> float(contacts.Sphere(center=(0.0, 0.0), radius=4.0).gap(0.0, ball.position))
+        6.0
+    """
 
     center: Float[Array, "..."] = quantity("center", "m")
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
@@ -277,6 +297,10 @@ class Room(Surface):
 
     A lane that turns around within one step, after it has come from the other half of the room, is seen to touch only if
     it ends outside: take steps in which no lane flies up from the floor, touches the ceiling and comes back.
+
+    Example:
+        >>> float(contacts.Room((-4.0, 0.0), (7.0, 12.0)).gap(0.0, ball.position))
+        2.0
     """
 
     lower: Float[Array, "..."] = quantity("lower corner", "m")

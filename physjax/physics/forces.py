@@ -39,7 +39,12 @@ __all__ = [
 
 
 class Gravity(Field):
-    """Weight near the ground: F = m g, down the axis `up` (1: y). The lecture prints g = -9.8; here g > 0 and up is up."""
+    """Weight near the ground: F = m g, down the axis `up` (1: y). The lecture prints g = -9.8; here g > 0 and up is up.
+
+    Example:
+        >>> print(forces.Gravity()(0.0, ball, shot.mass))
+        [ -0.  -19.6]
+    """
 
     definite: ClassVar[bool] = True
     g: Float[Array, "..."] = quantity("g", "m/s²", default=9.8)
@@ -60,6 +65,11 @@ class Blast(Force):
     Half of J arrives at the `reach` r [m], and far out it thins as 1/d², like a wave that spreads. `impulse` J is a number
     or one per lane (a plate that shows more of its face gets more); what stands in the center itself stays. The force
     follows a lane that moves while it lasts. As with `Kick`, a step feels its mean in time.
+
+    Example:
+        >>> blast = forces.Blast(center=(0.0, 9.0), impulse=4.0, reach=1.0, at=0.0, duration=0.5)
+        >>> print(blast(0.1, ball, shot.mass))
+        [0. 4.]
     """
 
     center: Float[Array, "..."] = quantity("center of the blast", "m")
@@ -104,6 +114,10 @@ class StokesDrag(Force):
     """Creeping flow past a sphere: F = -b v with b = 6πηr [kg/s], v relative to the wind [m/s].
 
     The lecture's drag at low velocity.
+
+    Example:
+        >>> print(forces.StokesDrag(0.5, wind=(1.0, 0.0))(0.0, ball, shot.mass))
+        [-1. -2.]
     """
 
     definite: ClassVar[bool] = True
@@ -123,7 +137,12 @@ class StokesDrag(Force):
 
 
 class QuadraticDrag(Force):
-    """Drag at high velocity: F = -½ρC_dA |v| v, v relative to the wind. The lecture prints it without its minus sign."""
+    """Drag at high velocity: F = -½ρC_dA |v| v, v relative to the wind. The lecture prints it without its minus sign.
+
+    Example:
+        >>> print(forces.QuadraticDrag(area=0.2, coefficient=1.0, density=2.0)(0.0, ball, shot.mass))
+        [-3. -4.]
+    """
 
     definite: ClassVar[bool] = True
     area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
@@ -143,6 +162,12 @@ class SphereDrag(Force):
     F = -3πηd v [1 + 0.15 Re^0.681 + (0.407 Re/24)/(1 + 8710/Re)]: Stokes' law with the correction of P. P. Brown and D.
     F. Lawler, "Sphere drag and settling velocity revisited", J. Environ. Eng. 129 (2003) 222. Radius [m], density
     [kg/m³], viscosity [Pa s].
+
+    Example:
+        >>> drop = Particles(jnp.zeros(3), jnp.array([0.0, 0.0, 1e-3]))
+        >>> force = forces.SphereDrag(radius=1e-6)(0.0, drop, shot.mass)[2]
+        >>> round(float(force / (-6 * np.pi * 1.81e-5 * 1e-6 * 1e-3)), 2)
+        1.0
     """
 
     definite: ClassVar[bool] = True
@@ -165,6 +190,10 @@ class Magnus(Force):
 
     `axis` is the direction of the spin, a vector in space, a number (+1 anticlockwise) in the plane; its length is left
     out.
+
+    Example:
+        >>> print(forces.Magnus(area=0.2, coefficient=1.0, axis=1.0, density=2.0)(0.0, ball, shot.mass))
+        [-4.  3.]
     """
 
     area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
@@ -185,6 +214,10 @@ class Buoyancy(Force):
 
     Immersed: give `volume` [m³]. A ball that crosses the fluid's surface: give its `radius` [m] and the height
     `surface` [m] of the fluid; the part below it counts, V = πh²(3r - h)/3 for a submerged depth h.
+
+    Example:
+        >>> print(forces.Buoyancy(density=1000.0, volume=0.002)(0.0, ball, shot.mass))
+        [ 0.  19.6]
     """
 
     definite: ClassVar[bool] = True
@@ -232,6 +265,10 @@ class RotatingFrame(Field):
 
     `omega` [rad/s] is a vector in space, a number (anticlockwise) in the plane; `omega_rate` is its constant rate of
     change [rad/s²]. Positions are measured from the axis, omega is given at t = 0.
+
+    Example:
+        >>> print(forces.RotatingFrame(omega=1.0)(0.0, ball, shot.mass))
+        [16.  8.]
     """
 
     omega: Float[Array, "..."] = quantity("omega", "rad/s")
@@ -252,6 +289,10 @@ class Anchor(Force):
 
     Without a rest length L it pulls in all directions alike, F = -k d - c v: the harmonic oscillator. Stiffness [N/m],
     damping [kg/s].
+
+    Example:
+        >>> print(forces.Anchor(point=(1.0, 8.0), stiffness=5.0)(0.0, ball, shot.mass))
+        [  5. -10.]
     """
 
     point: Float[Array, "..."] = quantity("anchor point", "m")
@@ -281,6 +322,11 @@ def independent(force: Callable) -> Function:
     """Say of a plain function `(t, state, mass) -> newtons` that no lane's force depends on another lane.
 
     The run then has a status and may have a step for each lane; a bare function counts as coupling.
+
+    Example:
+        >>> lift = forces.independent(lambda t, state, mass: 0.5 * state.velocity)
+        >>> Scene(ball, forces=(lift,)).couples
+        False
     """
     return Function(force, couples=False)
 

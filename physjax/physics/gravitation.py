@@ -21,6 +21,12 @@ class Gravitation(Field):
     `G` [m³/kg/s²] (the lecture's 6.673e-11 by argument) with the scene's masses, or `gm` [m³/s²] for each body, which
     astronomers know far better than either. `softening` ε [m] is Plummer's. Two bodies at the same point do not act on
     each other.
+
+    Example:
+        >>> pair = Particles(jnp.array([[0.0, 0.0], [2.0, 0.0]]), jnp.zeros((2, 2)))
+        >>> print(loads(Scene(pair, mass=jnp.array([3.0, 4.0]), forces=(forces.Gravitation(G=1.0),)), 0.0))
+        [[ 3.  0.]
+         [-3.  0.]]
     """
 
     couples: ClassVar[bool] = True

@@ -36,6 +36,12 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
     energy and all, for the next step, so nothing ever passes. When a flight to the next bounce would be shorter than a
     quarter of a step, the lane comes to rest: the bounces that remain take 2v/(g(1 - K_r)) more, which
     `touching_since` records. From then on it is held by the surface, lies still or slides, until a force lifts it off.
+
+    Example:
+        >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.impact)
+        >>> falling = Scene(Particles(jnp.array([0.0, 1.0]), jnp.array([0.0, -2.0])), contacts=(floor,))
+        >>> print(falling.step(methods.euler, 0.0, 1.0).state.position)
+        [0.  0.5]
     """
     walls = _walls(scene)
     since = tuple(wall.touching_since for wall in walls)

@@ -24,6 +24,10 @@ class Inertia(eqx.Module):
     `mass` is a scalar or per lane, `principal` `(3,)` or `(*lanes, 3)`, `axes` a quaternion from the principal axes to
     the body's frame, None where they are the same. A line has no moment about itself and cannot spin about it. `about`
     a point of itself, a body turns on a fixed pivot. Raises ValueError for numbers that no body has.
+
+    Example:
+        >>> Scene(body, mass=Inertia(mass=12.0, principal=(13.0, 10.0, 5.0))).mass.principal.tolist()
+        [13.0, 10.0, 5.0]
     """
 
     mass: Float[Array, "..."]
@@ -88,7 +92,13 @@ class Inertia(eqx.Module):
 
 
 class Solid(NamedTuple):
-    """An inertia, and where the centre of mass is in the coordinates that were given [m]."""
+    """An inertia, and where the centre of mass is in the coordinates that were given [m].
+
+    Example:
+        >>> pair = inertia.points([1.0, 3.0], [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+        >>> isinstance(pair, inertia.Solid), pair.center.tolist()
+        (True, [3.0, 0.0, 0.0])
+    """
 
     inertia: Inertia
     center: np.ndarray
@@ -98,25 +108,45 @@ class Solid(NamedTuple):
 
 
 def box(mass: ArrayLike, size: ArrayLike) -> Inertia:
-    """A box with edges a, b, c [m] along the axes: I = m/12 (b² + c², c² + a², a² + b²)."""
+    """A box with edges a, b, c [m] along the axes: I = m/12 (b² + c², c² + a², a² + b²).
+
+    Example:
+        >>> inertia.box(12.0, (1.0, 2.0, 3.0)).principal.tolist()
+        [13.0, 10.0, 5.0]
+    """
     a, b, c = jnp.moveaxis(real_quantity("size [m]", size, above=0.0) ** 2, -1, 0)
     return _of_shape(mass, 1 / 12, b + c, c + a, a + b)
 
 
 def sphere(mass: ArrayLike, radius: ArrayLike, *, hollow: bool = False) -> Inertia:
-    """A ball: I = 2/5 m r²; a thin shell: 2/3 m r²."""
+    """A ball: I = 2/5 m r²; a thin shell: 2/3 m r².
+
+    Example:
+        >>> inertia.sphere(5.0, radius=2.0).principal.tolist()
+        [8.0, 8.0, 8.0]
+    """
     square = real_quantity("radius [m]", radius, above=0.0) ** 2
     return _of_shape(mass, 2 / 3 if hollow else 2 / 5, square, square, square)
 
 
 def cylinder(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
-    """A cylinder along an axis of its frame (2: z): I = m r²/2 about it, m (3r² + l²)/12 across."""
+    """A cylinder along an axis of its frame (2: z): I = m r²/2 about it, m (3r² + l²)/12 across.
+
+    Example:
+        >>> inertia.cylinder(12.0, radius=1.0, length=3.0).principal.tolist()
+        [12.0, 12.0, 6.0]
+    """
     radius, length = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)
     return _along(mass, axis, radius**2 / 2, (3 * radius**2 + length**2) / 12)
 
 
 def rod(mass: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
-    """A thin rod along an axis of its frame: I = m l²/12 across, none about itself."""
+    """A thin rod along an axis of its frame: I = m l²/12 across, none about itself.
+
+    Example:
+        >>> inertia.rod(3.0, length=2.0).principal.tolist()
+        [1.0, 1.0, 0.0]
+    """
     length = real_quantity("length [m]", length, above=0.0)
     return _along(mass, axis, 0.0 * length, length**2 / 12)
 
@@ -126,6 +156,10 @@ def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int 
 
     With their shares of the mass, s = 4r/(3l + 4r) and 1 - s: I = (1 - s) m r²/2 + s m 2r²/5 about the axis, (1 - s)
     m (3r² + l²)/12 + s m (2r²/5 + l²/4 + 3lr/8) across.
+
+    Example:
+        >>> print(inertia.capsule(7.0, radius=1.0, length=1.0).principal)
+        [5.1 5.1 3.1]
     """
     r, l = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)  # noqa: E741
     s = 4 * r / (3 * l + 4 * r)
@@ -138,7 +172,12 @@ def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int 
 
 
 def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
-    """The inertia of a full symmetric tensor in the body's frame [kg m²], `(3, 3)` or per lane; diagonalised on the host."""
+    """The inertia of a full symmetric tensor in the body's frame [kg m²], `(3, 3)` or per lane; diagonalised on the host.
+
+    Example:
+        >>> print(inertia.of_tensor(1.0, [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 3.0]]).principal)
+        [1. 3. 3.]
+    """
     (tensor,) = _on_host("tensor", tensor)
     if tensor.shape[-2:] != (3, 3):
         raise ValueError(f"tensor [kg m²]: got shape {tensor.shape}, expected (3, 3) or (*lanes, 3, 3).")
@@ -157,7 +196,13 @@ def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
 
 
 def points(masses: ArrayLike, positions: ArrayLike) -> Solid:
-    """Point masses [kg] `(n,)` held together at positions [m] `(n, 3)`: I = Σ m (|r|² 1 - r rᵀ)."""
+    """Point masses [kg] `(n,)` held together at positions [m] `(n, 3)`: I = Σ m (|r|² 1 - r rᵀ).
+
+    Example:
+        >>> cross = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0]]
+        >>> print(np.sort(inertia.points(np.ones(4), cross).inertia.principal))
+        [ 2.  8. 10.]
+    """
     masses, positions = _on_host("points", real_quantity("masses [kg]", masses, above=0.0), positions)
     if positions.ndim != 2 or positions.shape != (masses.size, 3) or masses.ndim != 1:
         raise ValueError(
@@ -172,6 +217,12 @@ def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float
 
     Exact for the polyhedron: a sum over the tetrahedra between each face and a point. `meshes.read_mesh` reads
     vertices [m] and faces from a file. Raises ValueError for a mesh that is open, or whose faces do not turn alike.
+
+    Example:
+        >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> solid = inertia.mesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], density=6.0)
+        >>> round(float(solid.inertia.mass), 3), solid.center.round(3).tolist()
+        (1.0, [0.25, 0.25, 0.25])
     """
     if (mass is None) == (density is None):
         raise ValueError("mesh: expected either mass= [kg] or density= [kg/m³].")
@@ -196,6 +247,11 @@ def composite(parts: Any) -> Solid:
     """Bodies held together: `(inertia, position)` or `(inertia, position, orientation)` for each, by the parallel-axis theorem.
 
     Positions [m] of the centres of mass and orientations (quaternions) are in the frame of the whole.
+
+    Example:
+        >>> pair = inertia.composite([(inertia.sphere(5.0, 1.0), (0.0, 0.0, z)) for z in (-2.0, 2.0)])
+        >>> print(pair.inertia.principal)
+        [44. 44.  4.]
     """
     parts = [(*part, (1.0, 0.0, 0.0, 0.0))[:3] for part in parts]
     if not parts or any(not isinstance(body, Inertia) or body.arm is not None for body, _, _ in parts):
@@ -215,7 +271,12 @@ def composite(parts: Any) -> Solid:
 
 
 def real_turn(name: str, value: Any) -> Float[Array, "*lanes 4"]:
-    """A quaternion (w, x, y, z) brought to length 1; a ValueError for zero, which turns nothing anywhere."""
+    """A quaternion (w, x, y, z) brought to length 1; a ValueError for zero, which turns nothing anywhere.
+
+    Example:
+        >>> print(inertia.real_turn("orientation", (3.0, 0.0, 0.0, 4.0)))
+        [0.6 0.  0.  0.8]
+    """
     q = real_quantity(name, value)
     if q.shape[-1:] != (4,):
         raise ValueError(f"{name}: got shape {q.shape}, expected a quaternion (w, x, y, z), (4,) or (*lanes, 4).")

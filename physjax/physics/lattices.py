@@ -25,6 +25,10 @@ class Lattice(NamedTuple):
 
     `nodes` are boolean masks by name; `faces` `(faces, 3)` are triangles of nodes. `shape` is that of a lattice, such
     as (rows, columns); None for a mesh.
+
+    Example:
+        >>> sheet.shape, np.flatnonzero(sheet.nodes["left"]).tolist()
+        ((3, 3), [0, 3, 6])
     """
 
     state: Particles
@@ -66,6 +70,11 @@ def rope(
     """A rope from `start` to `end` [m], in the plane or in space, with its nodes at equal distances.
 
     It is as long as the way unless `length` [m] says otherwise; a longer one begins slack. Sets: start, end, ends.
+
+    Example:
+        >>> rope = lattices.rope((0.0, 0.0), (4.0, 0.0), nodes=5, mass=1.0, stiffness=100.0)
+        >>> print(rope.state.position[:, 0], len(rope.springs.pairs))
+        [0. 1. 2. 3. 4.] 4
     """
     nodes = positive_integer("nodes", nodes, at_least=2)
     ends = [np.asarray(real_quantity(name, value)) for name, value in (("start [m]", start), ("end [m]", end))]
@@ -104,6 +113,11 @@ def cloth(
     Structural springs tie neighbours, shear springs the diagonals, bend springs every other node. The upper left
     `corner` [m] is node 0; rows run `across`, columns `down`: with down=(0, 0, 1) it lies instead of hanging. Sets: top,
     bottom, left, right, edge, corners, top_left, top_right, bottom_left, bottom_right.
+
+    Example:
+        >>> sail = lattices.cloth(2.0, 1.0, rows=2, columns=3, mass=0.6, structural=100.0, shear=50.0)
+        >>> len(sail.state.position), len(sail.springs.pairs)
+        (6, 11)
     """
     rows, columns = positive_integer("rows", rows, at_least=2), positive_integer("columns", columns, at_least=2)
     lengths = [float(real_quantity(f"{n} [m]", v, above=0)) for n, v in (("width", width), ("height", height))]
@@ -151,6 +165,11 @@ def jelly(
 
     Structural springs tie neighbours, shear springs the diagonals of faces and of the cells, bend springs every other
     node. Sets: left and right (x), bottom and top (y), back and front (z), surface, corners.
+
+    Example:
+        >>> cube = lattices.jelly((1.0, 1.0, 1.0), (2, 2, 2), mass=1.0, structural=100.0)
+        >>> len(cube.state.position), len(cube.springs.pairs)
+        (8, 12)
     """
     shape = tuple(positive_integer("nodes", n, at_least=2) for n in nodes)
     lengths, corner = (
@@ -197,6 +216,11 @@ def bridge(
     With a `width` [m] there are two such trusses side by side, z = 0 and z = width, braced to each other above and
     below. Mass goes with the length of the beams. Sets: deck (the lower chord), top, left, right, supports (the ends of
     the deck).
+
+    Example:
+        >>> truss = lattices.bridge(4.0, 1.0, panels=4, mass=100.0, stiffness=2e4)
+        >>> len(truss.state.position), len(truss.springs.pairs), int(truss.nodes["supports"].sum())
+        (10, 21, 2)
     """
     panels = positive_integer("panels", panels, at_least=1)
     sides = [span, height] if width is None else [span, height, width]
@@ -228,6 +252,12 @@ def from_mesh(
 
     Structural springs are the edges of the triangles, bend springs tie the vertices opposite each inner edge. A node
     has a third of the area around it. Sets: edge (on the boundary).
+
+    Example:
+        >>> square = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+        >>> net = lattices.from_mesh(square, [[0, 1, 2], [0, 2, 3]], mass=0.6, structural=100.0)
+        >>> print(len(net.springs.pairs), net.mass)
+        5 [0.2 0.1 0.2 0.1]
     """
     if isinstance(mesh, str | os.PathLike):
         if faces is not None:

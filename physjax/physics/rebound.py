@@ -11,7 +11,15 @@ from physjax.vectors import dot, scale
 
 
 class Coulomb(eqx.Module):
-    """Dry friction: a touch holds up to μ_s times the normal impulse or force; beyond, it slips, braked by μ_k times it."""
+    """Dry friction: a touch holds up to μ_s times the normal impulse or force; beyond, it slips, braked by μ_k times it.
+
+    Example:
+        >>> dry = contacts.Coulomb(static=0.6, kinetic=0.5)
+        >>> road = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0, coulomb=dry)
+        >>> skid = Particles(jnp.array([0.0, -0.1]), jnp.array([3.0, -4.0]))
+        >>> print(road.respond(0.0, skid).velocity)
+        [1. 0.]
+    """
 
     static: Float[Array, "..."] = quantity("static friction μ_s", "1", at_least=0)
     kinetic: Float[Array, "..."] = quantity("kinetic friction μ_k", "1", at_least=0)

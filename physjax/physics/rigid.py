@@ -65,6 +65,11 @@ def bodies(
     Vectors are `(3,)` for all or one per lane, `(*lanes, 3)`, the orientation a quaternion of any length. The angular
     velocity [rad/s] is in the `frame` of the "world" or the "body". On a pivot the velocity follows from it. The float
     type is the position's.
+
+    Example:
+        >>> turning = rigid.bodies(brick, angular_velocity=(0.0, 0.0, 2.0))
+        >>> print(turning.angular_momentum)
+        [ 0.  0. 10.]
     """
     _demand_frame(frame)
     named = {"position [m]": position, "velocity [m/s]": velocity, "angular velocity [rad/s]": angular_velocity}
@@ -84,7 +89,13 @@ def bodies(
 
 
 def on_bodies(function: Callable, *, couples: bool = False) -> Load:
-    """A plain function `(t, bodies, inertia) -> Wrench` as a load; say if one body's load depends on another."""
+    """A plain function `(t, bodies, inertia) -> Wrench` as a load; say if one body's load depends on another.
+
+    Example:
+        >>> spin_up = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(torque=0.5 * bodies.angular_momentum))
+        >>> print(loads(Scene(body, brick, (spin_up,)), 0.0).torque)
+        [0. 0. 5.]
+    """
     return OnBodies(function, couples)
 
 
@@ -92,19 +103,34 @@ def on_bodies(function: Callable, *, couples: bool = False) -> Load:
 
 
 def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """Where a point of each body is [m]: x + R p."""
+    """Where a point of each body is [m]: x + R p.
+
+    Example:
+        >>> print(rigid.point(body, (0.5, 0.0, 0.0)))
+        [0.5 0.  0. ]
+    """
     return bodies.position + in_world(bodies, place)
 
 
 def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """How fast a point of each body is [m/s]: v + ω × r."""
+    """How fast a point of each body is [m/s]: v + ω × r.
+
+    Example:
+        >>> print(rigid.point_velocity(body, brick, (0.5, 0.0, 0.0)))
+        [1. 1. 0.]
+    """
     return scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), in_world(bodies, place))
 
 
 def point_acceleration(
     scene: Scene, t: ArrayLike, place: ArrayLike, state: RigidBodies | None = None
 ) -> Float[Array, "*lanes 3"]:
-    """Acceleration of a point of each body [m/s²]: a + ω̇ × r + ω × (ω × r), at `scene.state` unless a state is given."""
+    """Acceleration of a point of each body [m/s²]: a + ω̇ × r + ω × (ω × r), at `scene.state` unless a state is given.
+
+    Example:
+        >>> print(rigid.point_acceleration(Scene(body, brick), 0.0, (0.5, 0.0, 0.0)))
+        [-2.  0.  0.]
+    """
     state = scene.state if state is None else state
     rate, r = scene.rate(t, state), in_world(state, place)
     omega, change = angular_velocity(state, scene.mass), angular_acceleration(state, scene.mass, rate.angular_momentum)
@@ -115,7 +141,12 @@ def point_acceleration(
 
 
 class Torque(Load):
-    """A torque [N m], in the frame of the "world" or of the "body"."""
+    """A torque [N m], in the frame of the "world" or of the "body".
+
+    Example:
+        >>> print(loads(Scene(body, brick, (rigid.Torque((0.0, 0.0, 5.0)),)), 0.0).torque)
+        [0. 0. 5.]
+    """
 
     torque: Float[Array, "..."] = quantity("torque", "N m")
     frame: str = eqx.field(static=True, default="world")
@@ -130,7 +161,13 @@ class Torque(Load):
 
 
 class RotationalDrag(Load):
-    """What a fluid takes from a turning body: τ = -c ω, c [N m s]; of a ball in creeping flow c = 8πηr³."""
+    """What a fluid takes from a turning body: τ = -c ω, c [N m s]; of a ball in creeping flow c = 8πηr³.
+
+    Example:
+        >>> brake = rigid.RotationalDrag(0.5)
+        >>> print(loads(Scene(body, brick, (brake,)), 0.0).torque)
+        [-0. -0. -1.]
+    """
 
     coefficient: Float[Array, "..."] = quantity("drag coefficient c", "N m s", at_least=0)
 
@@ -140,7 +177,13 @@ class RotationalDrag(Load):
 
 
 class Thrust(Load):
-    """A force [N] that turns with the body, at a `point` [m] of it: an engine. F = R f, τ = r × F."""
+    """A force [N] that turns with the body, at a `point` [m] of it: an engine. F = R f, τ = r × F.
+
+    Example:
+        >>> engine = rigid.Thrust((3.0, 0.0, 0.0), point=(0.0, 2.0, 0.0))
+        >>> print(*loads(Scene(body, brick, (engine,)), 0.0))
+        [3. 0. 0.] [ 0.  0. -6.]
+    """
 
     force: Float[Array, "..."] = quantity("thrust", "N")
     point: Float[Array, "..."] = quantity("point of the body", "m", default=(0.0, 0.0, 0.0))
@@ -157,6 +200,11 @@ class AtPoint(Load):
     A spring to the world is `AtPoint(point, forces.Anchor(...))`, a spring between points of two bodies
     `AtPoint(points, springs.Springs(pairs, ...))` with a point for each lane, a kick off centre `AtPoint(point,
     forces.Kick(...))`. What remembers (springs that break) cannot be so placed.
+
+    Example:
+        >>> off_center = rigid.AtPoint((0.0, 1.0, 0.0), forces.Constant((6.0, 0.0, 0.0)))
+        >>> print(loads(Scene(body, brick, (off_center,)), 0.0).torque)
+        [ 0.  0. -6.]
     """
 
     point: Float[Array, "..."] = quantity("point of the body", "m")

@@ -25,6 +25,12 @@ class Springs(Force):
     (l - L)/L; a run then keeps what is `intact`. `nodes` is the number of nodes, if more than the pairs name. `layout`
     is "bands" (shifted slices, for lattices) or "gather" (for meshes), chosen if not given. Raises ValueError or
     TypeError for pairs that are not pairs of different nodes, numbers < 0 and shapes that do not match.
+
+    Example:
+        >>> ends = Particles(jnp.array([[0.0, 0.0], [1.5, 0.0]]), jnp.zeros((2, 2)))
+        >>> spring = springs.Springs([[0, 1]], stiffness=10.0, rest_length=1.0)
+        >>> print(spring(0.0, ends, 1.0)[:, 0])
+        [ 5. -5.]
     """
 
     couples: ClassVar[bool] = True

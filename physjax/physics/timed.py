@@ -13,7 +13,12 @@ from physjax.vectors import dot, over, scale
 
 
 class Constant(Force):
-    """The same force at all times: F = F₀ [N]."""
+    """The same force at all times: F = F₀ [N].
+
+    Example:
+        >>> print(forces.Constant((1.0, -2.0))(0.0, ball, shot.mass))
+        [ 1. -2.]
+    """
 
     definite: ClassVar[bool] = True
     force: Float[Array, "..."] = quantity("force", "N")
@@ -32,6 +37,11 @@ class Kick(Force):
 
     A step feels its mean over the step, so that the whole impulse arrives under every method and at every step size.
     A lane whose impulse is zero is not kicked.
+
+    Example:
+        >>> kick = forces.Kick(impulse=(6.0, 0.0), at=0.0, duration=0.5)
+        >>> print(kick(0.1, ball, shot.mass), kick(0.6, ball, shot.mass))
+        [12.  0.] [0. 0.]
     """
 
     impulse: Float[Array, "..."] = quantity("impulse", "N s")
@@ -63,6 +73,11 @@ class Control(Force):
     the last at the end. Before and after there is none. Of constant pieces a step feels its mean, so that all of the
     impulse arrives at every step size; methods keep their order where steps end at the ends of the pieces. A step reads
     every value once (with `linear`, once a force evaluation). Raises ValueError for shapes that are none of these.
+
+    Example:
+        >>> push = forces.Control([[1.0, 0.0], [3.0, 0.0]], duration=2.0)
+        >>> print(push(0.5, ball, shot.mass), push(1.5, ball, shot.mass))
+        [1. 0.] [3. 0.]
     """
 
     definite: ClassVar[bool] = True

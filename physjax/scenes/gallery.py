@@ -16,19 +16,40 @@ FAILURES: dict[str, Callable] = {}
 
 
 def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
-    """Enter a function that builds a problem in the gallery, under its own name; the first line of its docstring describes it."""
+    """Enter a function that builds a problem in the gallery, under its own name; the first line of its docstring describes it.
+
+    Example:
+        >>> @scenes.scene
+        ... def drop():
+        ...     '''A ball that falls.'''
+        >>> scenes.title("drop"), scenes.SCENES.pop("drop") is drop
+        ('A ball that falls.', True)
+    """
     SCENES[build.__name__] = build
     return build
 
 
 def failure(build: Callable) -> Callable:
-    """Enter a function that builds a failure, in the same way."""
+    """Enter a function that builds a failure, in the same way.
+
+    Example:
+        >>> @scenes.failure
+        ... def lost():
+        ...     '''A ball that is lost.'''
+        >>> scenes.title("lost"), scenes.FAILURES.pop("lost") is lost
+        ('A ball that is lost.', True)
+    """
     FAILURES[build.__name__] = build
     return build
 
 
 def title(name: str) -> str:
-    """One line about a scene or a failure."""
+    """One line about a scene or a failure.
+
+    Example:
+        >>> scenes.title("projectile")
+        'A ball thrown in a vacuum: the parabola that every second-order method follows exactly.'
+    """
     return (SCENES | FAILURES)[name].__doc__.strip().splitlines()[0]
 
 

@@ -37,6 +37,11 @@ def cloth(
 
     A run that blew up is shown until its last good frame, and the title says so. Raises TypeError or ValueError for a
     film, a sheet, `fps` or `speed` that do not fit.
+
+    Example:
+        >>> film = animate.cloth(wave, sheet, speed=0.1)
+        >>> len(film.frames)
+        11
     """
     who = "animate.cloth"
     faces, nodes = faces_of(who, sheet)
@@ -53,7 +58,14 @@ def bodies(
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
-    """Rigid bodies with their real shapes; see `plot.bodies`, and `animate.cloth` for the errors."""
+    """Rigid bodies with their real shapes; see `plot.bodies`, and `animate.cloth` for the errors.
+
+    Example:
+        >>> from physjax.show import solids
+        >>> film = animate.bodies(tumble, solids.box((1.0, 2.0, 3.0)))
+        >>> len(film.frames)
+        11
+    """
     who = "animate.bodies"
     seen, faces = taken_bodies(who, film, shapes)
     frames, fps = schedule(who, seen, fps, speed)
@@ -69,7 +81,13 @@ def springs(
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
-    """Springs in the plane or in space, coloured by strain; see `plot.springs`, and `animate.cloth` for the errors."""
+    """Springs in the plane or in space, coloured by strain; see `plot.springs`, and `animate.cloth` for the errors.
+
+    Example:
+        >>> film = animate.springs(wave, sheet, speed=0.1)
+        >>> len(film.frames)
+        11
+    """
     who = "animate.springs"
     seen, given, index = take_springs(who, film, sheet, scene)
     frames, fps = schedule(who, seen, fps, speed)
@@ -91,6 +109,11 @@ def paths(
 
     In one dimension they stand side by side and move up and down. `every` draws one lane in so many, `color` colours
     lanes by a value each. Lanes that blew up vanish. Raises TypeError or ValueError for what does not fit.
+
+    Example:
+        >>> film = animate.paths(flight, fps=10.0)
+        >>> film.save("flight.gif", progress=False).name
+        'flight.gif'
     """
     who = "animate.paths"
     every, trail = positive_integer("every", every), float(real_quantity("trail [s]", trail, at_least=0))
@@ -105,6 +128,11 @@ def particles(film: Trajectory, *, fps: int | float = 30.0, speed: int | float =
     """Particles that are born and die, with the size, colour and opacity of their age; see `plot.particles`.
 
     Raises TypeError or ValueError for a run without an emitter, and for `fps` or `speed` that do not fit.
+
+    Example:
+        >>> film = animate.particles(jet)
+        >>> len(film.frames)
+        11
     """
     who = "animate.particles"
     seen, draw = cloud_of(who, film)

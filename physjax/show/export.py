@@ -47,6 +47,11 @@ def gltf(
 
     Raises TypeError or ValueError for what does not fit, too many frames among them (choose a lower `fps`, a higher
     `speed`, or `export.ply`), lanes that blew up, and springs that part, for glTF cannot take a line away.
+
+    Example:
+        >>> from physjax.show import solids
+        >>> export.gltf(tumble, "tumble.glb", solids.box((1.0, 2.0, 3.0)), progress=False).name
+        'tumble.glb'
     """
     who = "export.gltf"
     path = demanded(path, (".glb",))
@@ -87,6 +92,11 @@ def ply(
     Surfaces and bodies have faces, springs edges (those that hold), dots are points. Numbers are float32 [m]; lanes that
     blew up are left out, and the time of a frame [s] is in its header. Raises TypeError or ValueError for what does not
     fit, and an OSError for a folder that cannot be made or is not empty.
+
+    Example:
+        >>> files = export.ply(wave, "frames", sheet, speed=0.1, progress=False)
+        >>> files[0].name, len(files)
+        ('frame_0000.ply', 11)
     """
     who = "export.ply"
     folder = Path(folder)

@@ -32,6 +32,11 @@ class Film:
 
     In a notebook it shows itself, with buttons. `.save` writes it, `.still` draws a single picture of it. `frames` are the
     numbers of the run's frames that are shown. All pictures have the same limits.
+
+    Example:
+        >>> film = animate.paths(flight)
+        >>> isinstance(film, animate.Film), len(film.frames)
+        (True, 21)
     """
 
     def __init__(

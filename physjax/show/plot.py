@@ -47,6 +47,10 @@ def style(method: str) -> dict[str, Any]:
     """Line style of a method: colour and marker by its place in the registry, dashed and hollow where it is projected.
 
     Rivals are grey.
+
+    Example:
+        >>> plot.style("verlet")["marker"] != plot.style("euler")["marker"]
+        True
     """
     name = method.removesuffix(PROJECTED)
     if name in METHODS:
@@ -67,6 +71,11 @@ def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None,
     """Draw the paths of a run: height over time in one dimension, the plane in two, space in three, y up.
 
     `every` draws one lane in so many; `color` colours lanes by a value each. Returns the axes.
+
+    Example:
+        >>> ax = plot.paths(flight)
+        >>> ax.get_xlabel(), ax.get_ylabel()
+        ('x [m]', 'y [m]')
     """
     position = np.asarray(flight.position)
     return _paths(
@@ -110,6 +119,11 @@ def gradient_health(result: Any, ax: Any = None) -> Any:
 
     A line for each lane, or for each scene of coupled ones; a ring where it reaches its limit, at the end of a dotted line
     if it will do so soon after the run. Returns the axes.
+
+    Example:
+        >>> ax = plot.gradient_health(gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity"))
+        >>> ax.get_xlabel()
+        'time [s]'
     """
     from matplotlib import pyplot as plt
 
@@ -147,6 +161,12 @@ def work_precision(result: Any, figure: Any = None) -> Any:
     """Four panels of an `accuracy.WorkPrecision`: path, error against time, error against step, drift (or evaluations).
 
     Runs that failed stand as crosses on the upper edge, where they died. Returns the figure.
+
+    Example:
+        >>> chart = accuracy.work_precision(swing, [methods.verlet], [1 / 16, 1 / 32], duration=2.0, rivals=())
+        >>> figure = plot.work_precision(chart)
+        >>> len(figure.axes)
+        4
     """
     from matplotlib import pyplot as plt
 

@@ -78,6 +78,12 @@ def bodies(
 
     `shapes` is a `Shape` for all bodies or one for each: `solids.box`, `cylinder`, `capsule`, `sphere`, or
     `Shape(*meshes.read_mesh(file)).at(-center)`. For the rest see `plot.cloth`. Returns the figure.
+
+    Example:
+        >>> from physjax.show import solids
+        >>> figure = plot.bodies(tumble, solids.box((1.0, 2.0, 3.0)), frames=[0, -1])
+        >>> len(figure.axes)
+        2
     """
     who = "plot.bodies"
     seen, faces = taken_bodies(who, film, shapes)

@@ -56,6 +56,11 @@ def springs(
 
     `sheet` is a lattice or its springs. The colours go from -limit to limit, a strain; by default as far as 99 % of
     the springs that are shown. The others are as in `plot.cloth`. Returns the figure.
+
+    Example:
+        >>> figure = plot.springs(wave, sheet, frames=[0, 10])
+        >>> len(figure.axes)
+        3
     """
     who = "plot.springs"
     seen, given, index = take_springs(who, film, sheet, scene)

@@ -35,6 +35,11 @@ def cloth(
     end; without them the first, the middle and the last good one. Of a batch of scenes `scene` picks one. y is up, all
     directions have the same scale [m], and balls, floors and rooms of the scene are drawn lightly. Returns the figure.
     Raises TypeError, ValueError or IndexError for a film, a sheet or frames that do not fit.
+
+    Example:
+        >>> figure = plot.cloth(wave, sheet, frames=[0, 10])
+        >>> len(figure.axes)
+        2
     """
     who = "plot.cloth"
     faces, nodes = faces_of(who, sheet)

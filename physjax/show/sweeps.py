@@ -21,6 +21,12 @@ def sweep(result: Any, of: str | None = None, *, labels: dict[str, str] | None =
     """Draw the number `of` a `Sweep`; `labels` are words with units for axes and numbers, by their names.
 
     Returns the axes; for panels over a third axis the figure, and there `ax` is a figure to draw into.
+
+    Example:
+        >>> reach = lambda angle: projectile.horizontal_range(7.0, angle)
+        >>> ax = plot.sweep(sweep(reach, {"angle": [0.5, 0.7, 0.9]}, progress=False), labels={"angle": "angle [rad]"})
+        >>> ax.get_xlabel()
+        'angle [rad]'
     """
     number, bad = np.asarray(result.number(of), float), ~np.asarray(result.ok)
     axes = [(_label(axis.name, labels), np.asarray(axis.coordinate, float)) for axis in result.lanes.axes]

@@ -38,7 +38,12 @@ SHADES = 256
 
 
 class View:
-    """A page with the frames of a run, to be turned, zoomed and played. Shows itself in a notebook; `.save("x.html")`."""
+    """A page with the frames of a run, to be turned, zoomed and played. Shows itself in a notebook; `.save("x.html")`.
+
+    Example:
+        >>> isinstance(animate.view(wave, sheet), animate.View)
+        True
+    """
 
     def __init__(self, content: dict[str, Any]):
         self._content = content
@@ -83,6 +88,10 @@ def view(
 
     Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; 2-D films are for
     `animate.paths` and `animate.springs`.
+
+    Example:
+        >>> animate.view(wave, sheet).save("wave.html").name
+        'wave.html'
     """
     who = "animate.view"
     seen = subject(who, film, shown, scene)

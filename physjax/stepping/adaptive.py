@@ -194,6 +194,12 @@ def adaptive(
     the steps of one dt and makes the run differentiable in reverse; more of them needed is NaN as well. Symplectic
     methods (semi-implicit Euler, verlet, leapfrog) lose their virtue: with steps that follow the state their energy
     drifts.
+
+    Example:
+        >>> careful = methods.adaptive(methods.rk4, atol=1e-5, rtol=1e-5)
+        >>> end = simulate(swing, careful, dt=1.0, steps=1).position[-1, 0]
+        >>> round(float(end), 3), round(float(np.cos(2.0 * 1.0)), 3)
+        (-0.416, -0.416)
     """
     if not callable(method):
         raise TypeError(f"adaptive: got the method {method!r}, expected one such as methods.rk4.")
@@ -222,7 +228,13 @@ def adaptive(
 
 
 def count_steps(scene: Any, method: Adaptive, *, dt: ArrayLike, steps: int) -> Steps:
-    """Accepted and rejected steps of a run, dt by dt along a leading axis, the states at its ends with them."""
+    """Accepted and rejected steps of a run, dt by dt along a leading axis, the states at its ends with them.
+
+    Example:
+        >>> counts = methods.count_steps(swing, methods.adaptive(methods.rk4, atol=1e-5, rtol=1e-5), dt=1.0, steps=1)
+        >>> bool(counts.accepted[0] > 1)
+        True
+    """
     if not isinstance(method, Adaptive):
         raise TypeError(f"count_steps: got {type(method).__name__}, expected methods.adaptive(...).")
     return _counted(scene, method, real_quantity("dt [s]", dt, above=0.0), positive_integer("steps", steps))

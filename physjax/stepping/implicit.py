@@ -35,6 +35,10 @@ class ImplicitEuler(eqx.Module):
     `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass: √ε of the float type by
     default. A solve that does not converge raises nothing: `report` says so, with its residual. Derivatives go through
     the solution, not the iterations. Raises ValueError or TypeError for bad settings.
+
+    Example:
+        >>> print(swing.step(methods.ImplicitEuler(newton=4), 0.0, 0.5).state.position)
+        [0.5]
     """
 
     tolerance: float | None = eqx.field(static=True, default=None)

@@ -22,6 +22,11 @@ def euler(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
     """Explicit Euler: follow the slope at the start. One force a step; gains energy at any step without damping.
 
     The lecture's EulerStep and its listing `position += velocity*dt; velocity += acceleration*dt`.
+
+    Example:
+        >>> fall = methods.euler(shot, 0.0, ball, 1.0)
+        >>> print(fall.position, fall.velocity)
+        [ 3. 14.] [ 3.  -5.8]
     """
     return _along(state, system.rate(t, state), dt)
 
@@ -32,13 +37,24 @@ def semi_implicit_euler(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) ->
 
     The lecture's `Vel = Vel + Acc*dt; Pos = Pos + Vel*dt`, which it also calls Euler; a different method with different
     stability.
+
+    Example:
+        >>> fall = methods.semi_implicit_euler(shot, 0.0, ball, 1.0)
+        >>> print(fall.position, fall.velocity)
+        [3.  4.2] [ 3.  -5.8]
     """
     return system.drift(system.kick(state, system.rate(t, state), dt), dt)
 
 
 @promises(order=2, evaluations=2, stable_to=0.0)
 def midpoint(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
-    """Follow the slope found half a step ahead: second order; an oscillation grows by √(1 + (ωdt)⁴/4) a step."""
+    """Follow the slope found half a step ahead: second order; an oscillation grows by √(1 + (ωdt)⁴/4) a step.
+
+    Example:
+        >>> fall = methods.midpoint(shot, 0.0, ball, 1.0)
+        >>> print(fall.position, fall.velocity)
+        [3.  9.1] [ 3.  -5.8]
+    """
     half = _along(state, system.rate(t, state), dt / 2)
     return _along(state, system.rate(t + dt / 2, half), dt)
 
@@ -48,6 +64,11 @@ def verlet(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
     """Velocity Verlet: half a kick, drift, half a kick with the force found there. Second order, energy bounded.
 
     Forces that depend on velocity see the predicted v + a·dt at the end of the step, which keeps the order at 2.
+
+    Example:
+        >>> fall = methods.verlet(shot, 0.0, ball, 1.0)
+        >>> print(fall.position, fall.velocity)
+        [3.  9.1] [ 3.  -5.8]
     """
     start = system.rate(t, state)
     arrived = system.drift(system.kick(state, start, dt / 2), dt)
@@ -60,6 +81,11 @@ def leapfrog(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
     """Drift half way, kick, drift on: second order for one force a step, the cheapest where forces depend on position alone.
 
     Forces that depend on velocity see the old one, and the order falls to 1.
+
+    Example:
+        >>> end = methods.leapfrog(swing, 0.0, swing.state, 0.5)
+        >>> print(end.position, end.velocity)
+        [0.5] [-2.]
     """
     half = system.drift(state, dt / 2)
     return system.drift(system.kick(half, system.rate(t + dt / 2, half), dt), dt / 2)
@@ -70,6 +96,11 @@ def rk4(system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
     """The classical Runge-Kutta method: four slopes, weighted 1 2 2 1. Loses energy near its limit.
 
     The lecture's RK4Integration.
+
+    Example:
+        >>> end = methods.rk4(swing, 0.0, swing.state, 0.1)
+        >>> round(float(end.position[0]), 4), round(float(np.cos(2.0 * 0.1)), 4)
+        (0.9801, 0.9801)
     """
     k1 = system.rate(t, state)
     k2 = system.rate(t + dt / 2, _along(state, k1, dt / 2))

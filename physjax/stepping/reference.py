@@ -38,6 +38,10 @@ def ode_term(scene: Scene) -> "diffrax.ODETerm":
 
     The equations of motion between steps: contacts are not in it, and parts that remember do not advance. Forces that
     jump at known times (`Kick`) need `ClipStepSizeController(jump_ts=discontinuities(scene))`.
+
+    Example:
+        >>> print(ode_term(shot).vf(0.0, ball, None).velocity)
+        [-0.  -9.8]
     """
     import diffrax
 
@@ -63,6 +67,11 @@ def reference(
     `times` are ascending and >= 0; the scene's state holds at t = 0. Dopri8 unless another diffrax solver is given; the
     largest error of any component is held below `atol + rtol |y|` a step. A solve that fails returns `.ok` False and
     non-finite frames. Raises ValueError for bad times or tolerances.
+
+    Example:
+        >>> print(reference(shot, times=[0.0, 1.0]).position)
+        [[ 0.  10. ]
+         [ 3.   9.1]]
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"reference: got a {type(scene).__name__}, expected a Scene.")

@@ -44,6 +44,11 @@ def simulate(
     the function once, a new one compiles anew. `first_step` continues the count of time: `simulate(flight.final_scene,
     ..., first_step=flight.final_step)` resumes a run. Under jit, vmap, jvp and grad as well. Raises ValueError or
     TypeError for bad numbers; a run that blows up returns with `.ok` False and `.first_bad_step`, it does not raise.
+
+    Example:
+        >>> run = simulate(shot, methods.verlet, dt=0.1, duration=2.0, save_every=10)
+        >>> print(run.time, run.position[:, 1])
+        [0. 1. 2.] [10.   9.1 -1.6]
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"simulate: got a {type(scene).__name__}, expected a Scene.")
@@ -188,6 +193,11 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
 
     The count is data, not shape, so that one program serves every dt, also under jit and vmap: this is how dt is swept.
     Both are one number for the scene. Forward derivatives only.
+
+    Example:
+        >>> end = state_after(shot, methods.euler, duration=1.0, dt=0.3)
+        >>> int(end.steps), round(float(end.dt), 4)
+        (3, 0.3333)
     """
     duration = real_quantity("duration [s]", duration, above=0.0).astype(scene.state.dtype)
     dt = real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype)

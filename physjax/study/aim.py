@@ -114,6 +114,12 @@ def aim_at(
     and every number of the scene.
 
     Raises ValueError or TypeError for a speed <= 0, a target at the start, a launch that is not free.
+
+    Example:
+        >>> start = Scene(Particles(jnp.zeros(2), jnp.zeros(2)), forces=(forces.Gravity(),))
+        >>> aimed = aim_at(start, (5.0, 0.0), speed=9.9)
+        >>> [round(float(np.rad2deg(shot.angle))) for shot in (aimed.low, aimed.high)]
+        [15, 75]
     """
     shots = _range(scene, target, method, steps)
     bounces = _checked_bounces(bounces, speed, shots.scene)

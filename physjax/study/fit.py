@@ -42,6 +42,11 @@ def fit(predict: Callable, guess: Any, observed: Any, *, sigma: Any = None, max_
     Under vmap, a thousand experiments in one call, each with its own `ok`; what does not converge harms no other. The
     fitted numbers can be differentiated by what was observed and by what `predict` closes over. Raises ValueError or
     TypeError for shapes that do not match, fewer observations than numbers, and sigma <= 0.
+
+    Example:
+        >>> fallen = lambda g: 0.5 * g * jnp.array([1.0, 4.0, 9.0])
+        >>> round(float(fit(fallen, guess=5.0, observed=np.array([4.9, 19.6, 44.1])).value), 3)
+        9.8
     """
     if not callable(predict):
         raise TypeError(

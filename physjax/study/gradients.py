@@ -27,6 +27,11 @@ class GradientHealth(eqx.Module):
     then 0. `limit` is the sensitivity at which the error of the start has become the given fraction of the path, `horizon`
     [s] the time at which it does: beyond it a gradient says nothing about the true path. A horizon beyond the run goes on
     with the law found.
+
+    Example:
+        >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
+        >>> isinstance(told, gradients.GradientHealth), bool(told.exponential)
+        (True, False)
     """
 
     time: Float[Array, "frames *units"]
@@ -68,6 +73,11 @@ def health(
     times sensitivity reaches the `fraction` of `size` [m]: of how far the path goes, as the frames tell, if not given.
     Under vmap and jit as well. Raises ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up
     has an infinite sensitivity from there on.
+
+    Example:
+        >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
+        >>> round(float(told.power), 3), round(float(told.sensitivity[-1]), 3)
+        (1.0, 2.0)
     """
     known("kind of deviation", of, ("position", "velocity"))
     fraction = real_quantity("fraction", fraction, above=0.0)

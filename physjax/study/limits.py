@@ -26,7 +26,13 @@ SEEN = 1e-6
 
 
 class Region(NamedTuple):
-    """Spectral radius of a method's step over a grid of z = λ dt: stable where it is at most 1."""
+    """Spectral radius of a method's step over a grid of z = λ dt: stable where it is at most 1.
+
+    Example:
+        >>> square = stability.region(methods.euler, real=(-1.0, 1.0), imaginary=(0.0, 1.0), points=(3, 2))
+        >>> isinstance(square, stability.Region), square.radius.shape
+        (True, (2, 3))
+    """
 
     name: str
     z: np.ndarray
@@ -46,6 +52,10 @@ class Limit(NamedTuple):
     where lanes are coupled). `cause` is "stiffness", "damping" or "nothing"; `force` the name of the force, `spring`
     the two nodes of the spring that takes the largest part in the mode (None for other forces), `node` the lane that
     moves most, as an index. `rate` is the mode's λ [1/s].
+
+    Example:
+        >>> print(stability.limit(swing, methods.verlet))
+        verlet: 1 s, set by the stiffness of Anchor, λ = ±2i 1/s
     """
 
     method: str
@@ -73,6 +83,11 @@ def region(
     """The spectral radius of one step of a method over a grid of complex λ dt, by running the method itself.
 
     On x″ = −|λ|²x + 2Re(λ)x′, all grid points in one batched call, so it serves methods that kick and drift as well.
+
+    Example:
+        >>> line = stability.region(methods.euler, real=(-2.0, 0.0), imaginary=(0.0, 0.0), points=(3, 1))
+        >>> print(line.radius)
+        [[1. 0. 1.]]
     """
     with jax.enable_x64(True):
         z = np.linspace(*real, points[0]) + 1j * np.linspace(*imaginary, points[1])[:, None]
@@ -84,6 +99,11 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
 
     Modes that do not move (a free body as a whole) and those that grow by themselves (a pendulum upside down) set no
     limit. All modes of scenes with up to 300 coordinates are looked at, of larger ones the fastest. Contacts are not.
+
+    Example:
+        >>> limit = stability.limit(swing, methods.verlet)
+        >>> round(limit.dt, 3), limit.cause
+        (1.0, 'stiffness')
     """
     with jax.enable_x64(True):
         scene, state = about(scene, at)
@@ -104,6 +124,10 @@ def growth(scene: Scene, method: Callable, dt: Any, at: Particles | None = None)
 
     Shaped like `scene.status_shape`, as `dt` may be; 1 for a stable step. Drifts are left out. For methods without a
     stable step this is what to expect of a run.
+
+    Example:
+        >>> round(float(stability.growth(swing, methods.euler, 0.5)) ** 2, 3)
+        2.0
     """
     with jax.enable_x64(True):
         scene, state = about(scene, at)
@@ -119,6 +143,10 @@ def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
     """Whether small motions about a state grow whatever the method: a pendulum upside down, bodies that pass each other.
 
     Shaped like `scene.status_shape`. What a method adds to that cannot be seen in a run.
+
+    Example:
+        >>> bool(stability.grows_by_itself(swing))
+        False
     """
     with jax.enable_x64(True):
         rates = small_motion(*about(scene, at)).rates()

@@ -48,14 +48,26 @@ _UNITS = {"t": "s", "speed": "m/s", "angle": "rad", "g": "m/s²"}
 
 
 class Aim(NamedTuple):
-    """An angle [rad], and whether there is one; NaN where there is none."""
+    """An angle [rad], and whether there is one; NaN where there is none.
+
+    Example:
+        >>> aim = projectile.angle_for_apex(11.0, speed=14.0)
+        >>> isinstance(aim, projectile.Aim), bool(aim.ok)
+        (True, False)
+    """
 
     angle: Float[Array, "..."]
     ok: Bool[Array, "..."]
 
 
 class Arcs(NamedTuple):
-    """The flat and the steep angle [rad] that hit a target, and whether it is in reach; NaN where it is not."""
+    """The flat and the steep angle [rad] that hit a target, and whether it is in reach; NaN where it is not.
+
+    Example:
+        >>> arcs = projectile.angles_for_range(21.0, speed=14.0)
+        >>> isinstance(arcs, projectile.Arcs), bool(arcs.ok)
+        (True, False)
+    """
 
     low: Float[Array, "..."]
     high: Float[Array, "..."]
@@ -63,7 +75,13 @@ class Arcs(NamedTuple):
 
 
 class LeastSpeed(NamedTuple):
-    """The smallest speed [m/s] that reaches a target, and the angle [rad] it takes."""
+    """The smallest speed [m/s] that reaches a target, and the angle [rad] it takes.
+
+    Example:
+        >>> needed = projectile.least_speed(5.0, 0.0)
+        >>> isinstance(needed, projectile.LeastSpeed), round(float(np.rad2deg(needed.angle)), 3)
+        (True, 45.0)
+    """
 
     speed: Float[Array, "..."]
     angle: Float[Array, "..."]
@@ -72,13 +90,23 @@ class LeastSpeed(NamedTuple):
 def position(
     t: ArrayLike, speed: ArrayLike, angle: ArrayLike, *, height: ArrayLike = 0.0, g: ArrayLike = 9.8
 ) -> Float[Array, "*lanes 2"]:
-    """Where the shot is: x = s cosθ t, y = y₀ + s sinθ t - ½gt² [m]."""
+    """Where the shot is: x = s cosθ t, y = y₀ + s sinθ t - ½gt² [m].
+
+    Example:
+        >>> print(projectile.position(1.0, speed=10.0, angle=0.0, height=4.9))
+        [10.  0.]
+    """
     t, s, theta, y0, g = _numbers(t=t, speed=speed, angle=angle, height=height, g=g)
     return jnp.stack([s * jnp.cos(theta) * t, y0 + (s * jnp.sin(theta) - 0.5 * g * t) * t], axis=-1)
 
 
 def velocity(t: ArrayLike, speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike = 9.8) -> Float[Array, "*lanes 2"]:
-    """How it moves: v = (s cosθ, s sinθ - gt) [m/s]."""
+    """How it moves: v = (s cosθ, s sinθ - gt) [m/s].
+
+    Example:
+        >>> print(projectile.velocity(1.0, speed=10.0, angle=0.0))
+        [10.  -9.8]
+    """
     t, s, theta, g = _numbers(t=t, speed=speed, angle=angle, g=g)
     return jnp.stack([s * jnp.cos(theta), s * jnp.sin(theta) - g * t], axis=-1)
 
@@ -87,6 +115,10 @@ def apex_time(speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike = 9.8) -> Floa
     """When it stops rising: v_y - gt = 0, so t = v_y/g [s]; negative for a shot aimed down, whose apex would lie behind it.
 
     The lecture prints `y(t) = v_y t - g t² = 0`; it means the velocity, v(t) = v_y - g t = 0.
+
+    Example:
+        >>> round(float(projectile.apex_time(9.8, np.deg2rad(90.0))), 3)
+        1.0
     """
     s, theta, g = _numbers(speed=speed, angle=angle, g=g)
     return s * jnp.sin(theta) / g
@@ -95,7 +127,12 @@ def apex_time(speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike = 9.8) -> Floa
 def apex_height(
     speed: ArrayLike, angle: ArrayLike, *, height: ArrayLike = 0.0, g: ArrayLike = 9.8
 ) -> Float[Array, "..."]:
-    """How high the parabola reaches: y₀ + v_y²/2g [m]."""
+    """How high the parabola reaches: y₀ + v_y²/2g [m].
+
+    Example:
+        >>> round(float(projectile.apex_height(14.0, np.deg2rad(90.0))), 3)
+        10.0
+    """
     s, theta, y0, g = _numbers(speed=speed, angle=angle, height=height, g=g)
     return y0 + (s * jnp.sin(theta)) ** 2 / (2.0 * g)
 
@@ -111,6 +148,10 @@ def flight_time(
     """When it comes down to the target's height: t = (v_y + √(v_y² + 2g(y₀ - y)))/g [s]; on level ground 2v_y/g.
 
     The later of the two crossings. NaN for a height that is not reached from the launch on.
+
+    Example:
+        >>> round(float(projectile.flight_time(9.8, np.deg2rad(90.0))), 3)
+        2.0
     """
     s, theta, y0, y, g = _numbers(speed=speed, angle=angle, height=height, target_height=target_height, g=g)
     return _later_crossing(s * jnp.sin(theta), y0, y, g)
@@ -127,6 +168,10 @@ def horizontal_range(
     """How far it comes until then: v_x times the flight time [m]; on level ground 2v_x v_y/g.
 
     Negative for angles beyond a right angle; NaN for a height that is not reached.
+
+    Example:
+        >>> round(float(projectile.horizontal_range(14.0, np.deg2rad(45.0))), 3)
+        20.0
     """
     s, theta, y0, y, g = _numbers(speed=speed, angle=angle, height=height, target_height=target_height, g=g)
     return s * jnp.cos(theta) * _later_crossing(s * jnp.sin(theta), y0, y, g)
@@ -137,6 +182,10 @@ def angle_for_apex(apex_height: ArrayLike, speed: ArrayLike, *, height: ArrayLik
 
     The lecture prints v_z under the root's sign; it is the vertical component, v_y. Written as an arctangent, which
     keeps its digits near the vertical.
+
+    Example:
+        >>> round(float(np.rad2deg(projectile.angle_for_apex(2.5, speed=14.0).angle)), 3)
+        30.0
     """
     h, s, y0, g = _numbers(apex_height=apex_height, speed=speed, height=height, g=g)
     rising = 2.0 * g * (h - y0)  # v_y²
@@ -152,6 +201,11 @@ def angles_for_range(distance: ArrayLike, speed: ArrayLike, *, g: ArrayLike = 9.
     """The angles that come down at a distance [m] on level ground: θ = ½ asin(rg/s²) and its complement to a right angle.
 
     A distance behind (negative) has the mirrored angles, beyond a right angle.
+
+    Example:
+        >>> arcs = projectile.angles_for_range(10.0, speed=14.0)
+        >>> round(float(np.rad2deg(arcs.low)), 3), round(float(np.rad2deg(arcs.high)), 3)
+        (15.0, 75.0)
     """
     r, s, g = _numbers(distance=distance, speed=speed, g=g)
     sine = g * r / (s * s)
@@ -167,6 +221,11 @@ def angles_for_target(distance: ArrayLike, rise: ArrayLike, speed: ArrayLike, *,
     distance. Both arcs go straight up to a target overhead, and to one straight below the low arc goes down and the
     high arc up first. A target behind (r < 0) has the mirrored angles, beyond a right angle. At the launch point itself
     the answers are those of a near point on level ground, 0 and a right angle.
+
+    Example:
+        >>> arcs = projectile.angles_for_target(10.0, 5.0, speed=14.0)
+        >>> print(projectile.position(10.0 / (14.0 * np.cos(arcs.low)), 14.0, arcs.low))
+        [10.  5.]
     """
     r, rise, s, g = _numbers(distance=distance, rise=rise, speed=speed, g=g)
     a, b = g * r / (s * s), g * rise / (s * s)  # the formula divided by s²: a tanθ = 1 ± √(1 - 2b - a²)
@@ -182,6 +241,10 @@ def least_speed(distance: ArrayLike, rise: ArrayLike, *, g: ArrayLike = 9.8) -> 
     """The slowest shot that still hits a target at (r, Δy) [m]: s² = g(Δy + √(r² + Δy²)), halfway between target and vertical.
 
     θ = π/4 + ½ atan(Δy/r), mirrored for a target behind (r < 0). A target straight below needs no speed at all.
+
+    Example:
+        >>> round(float(projectile.least_speed(20.0, 0.0).speed), 3)
+        14.0
     """
     r, rise, g = _numbers(distance=distance, rise=rise, g=g)
     behind = r < 0

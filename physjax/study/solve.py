@@ -61,6 +61,10 @@ def solve(
 
     Raises ValueError or TypeError for guesses, bounds and tolerances that cannot be, and for fewer equations than
     unknowns.
+
+    Example:
+        >>> round(float(solve(lambda x: x**2 - 2.0, guess=1.0).value), 3)
+        1.414
     """
     import optimistix
 
@@ -109,6 +113,10 @@ def minimise(
 
     Bounds, tolerances and errors as in `solve`; at an active bound the answer moves with the bound. A minimum whose
     second derivatives are singular has no derivatives.
+
+    Example:
+        >>> round(float(minimise(lambda x: (x - 3.0) ** 2, guess=1.0).value), 3)
+        3.0
     """
     import optimistix
 

@@ -25,6 +25,11 @@ class StabilityMap(NamedTuple):
     """Verdicts `(methods, values, steps)`, an index into `VERDICTS`, with the `dts` [s] of each run and its error.
 
     `predicted` `(methods, values)` are the limits [s]. `parameter` names what `values` change; "" for a single scene.
+
+    Example:
+        >>> chart = stability.map(swing, [methods.verlet], dts=[0.01, 1.25])
+        >>> isinstance(chart, stability.StabilityMap), chart.verdict.shape
+        (True, (1, 1, 2))
     """
 
     methods: tuple[str, ...]
@@ -56,6 +61,10 @@ def map(
     With a `parameter` (name, values), `scene` is a function of such a value. Judged by the positions after `duration`
     [s] and on the way (forty of the longest steps, if not given): inaccurate is an error of more than 5 % of the way
     gone, diverged one of more than ten times that way. Each dt is rounded to divide a quarter of the duration.
+
+    Example:
+        >>> stability.map(swing, [methods.verlet], dts=[0.01, 1.25]).verdict.tolist()
+        [[[0, 2]]]
     """
     for method in methods:
         checked_method(method)

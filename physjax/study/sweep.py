@@ -81,6 +81,13 @@ def sweep(
     On paper: 10⁸ lanes of 400 rk4 steps of a ball with drag, in the plane and in float32, are 763 chunks of 131 072 lanes
     and 1.3 MB, 1 GB in all, and take 53 s of one core at the measured 1.9 million lanes a core second, files included
     (`benchmarks/sweep.py`); 8 such cores 7 s.
+
+    Example:
+        >>> axes = {"speed": [7.0, 14.0], "angle": np.deg2rad([15.0, 45.0])}
+        >>> found = sweep(lambda speed, angle: projectile.horizontal_range(speed, angle), axes, progress=False)
+        >>> print(found.values)
+        [[ 2.5  5. ]
+         [10.  20. ]]
     """
     lanes = checked_lanes(axes, design)
     devices = _checked_devices(devices)

@@ -1,0 +1,93 @@
+"""Every public name shows an example, and every example does what it shows."""
+
+import doctest
+import inspect
+from types import ModuleType
+
+import jax
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+
+import physjax
+from physjax import Trajectory
+
+TO_COME = {
+    "accuracy.Budget",
+    "accuracy.Run",
+    "accuracy.WorkPrecision",
+    "accuracy.default_rivals",
+    "accuracy.work_precision",
+    "emitters.Appearance",
+    "emitters.Birth",
+    "emitters.Box",
+    "emitters.Disc",
+    "emitters.Emitter",
+    "emitters.Look",
+    "emitters.Mesh",
+    "emitters.Point",
+    "emitters.Source",
+    "emitters.Sphere",
+    "fields.Attractor",
+    "fields.Flow",
+    "fields.Turbulence",
+    "fields.Vortex",
+    "plot.particles",
+    "rigid.Balls",
+    "rigid.Hull",
+    "rigid.Joints",
+    "rigid.Touch",
+    "rigid.hinge",
+}
+"""Names without an example."""
+
+
+def offered(module):
+    """Public functions and classes of a module: what it lists or, where it lists nothing, what it defines."""
+    listed = getattr(module, "__all__", None)
+    for name in listed or vars(module):
+        thing = getattr(module, name)
+        ours = listed or (getattr(thing, "__module__", None) == module.__name__ and not name.startswith("_"))
+        if ours and (inspect.isclass(thing) or inspect.isfunction(thing)):
+            yield name, thing
+
+
+def public():
+    """All that a user can name, each once and under its shortest name."""
+    for name, thing in [*offered(physjax), *((f"Trajectory.{name}", part) for name, part in vars(Trajectory).items())]:
+        if inspect.getdoc(thing) and not name.rpartition(".")[2].startswith("_"):
+            yield thing, name
+    for module in filter(lambda part: isinstance(part, ModuleType), map(physjax.__getattribute__, physjax.__all__)):
+        yield from ((thing, f"{module.__name__.rpartition('.')[2]}.{name}") for name, thing in offered(module))
+
+
+NAMES = {name: thing for thing, name in reversed({thing: name for thing, name in reversed(list(public()))}.items())}
+
+
+def run(name, docstring, names):
+    """Run the examples of a docstring, of which there must be some."""
+    example = doctest.DocTestParser().get_doctest(docstring, names, name, None, None)
+    assert example.examples, f"{name} has no example"
+    told = []
+    doctest.DocTestRunner(optionflags=doctest.REPORT_NDIFF).run(example, out=told.append, clear_globs=False)
+    assert not told, "".join(told)
+    return example.globs
+
+
+@pytest.fixture(scope="module")
+def stock():
+    """The objects that the package's own docstring makes, with 64-bit types off and promotion allowed, as users have it."""
+    plain = jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow")
+    with plain[0], plain[1], plain[2], np.printoptions():
+        yield run("physjax", physjax.__doc__, {})
+    plt.close("all")
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in TO_COME])
+def test_the_example_of(name, stock, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(name, inspect.getdoc(NAMES[name]), dict(stock))
+
+
+def test_every_name_that_is_to_come_lacks_its_example():
+    assert {name for name in TO_COME if ">>>" in inspect.getdoc(NAMES[name])} == set()
