@@ -127,11 +127,11 @@ def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "S
     lane that crosses a thin obstacle within one step is not seen.
 
     Example:
-        >>> low = Particles(jnp.array([0.0, -0.1]), jnp.array([3.0, -4.0]))
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.project)
-        >>> after = floor.respond(0.0, low)
-        >>> print(after.position, after.velocity)
-        [0. 0.] [3. 2.]
+        >>> falling = Scene(Particles(jnp.array([0.0, 1.0]), jnp.array([0.0, -2.0])), contacts=(floor,))
+        >>> end = falling.step(methods.euler, 0.0, 1.0).state
+        >>> print(end.position, end.velocity)
+        [0. 0.] [0. 1.]
     """
     scene = motion(scene, t, dt)
     state = scene.state

@@ -53,15 +53,19 @@ def offered(module):
 
 
 def public():
-    """All that a user can name, each once and under its shortest name."""
-    for name, thing in [*offered(physjax), *((f"Trajectory.{name}", part) for name, part in vars(Trajectory).items())]:
-        if inspect.getdoc(thing) and not name.rpartition(".")[2].startswith("_"):
-            yield thing, name
-    for module in filter(lambda part: isinstance(part, ModuleType), map(physjax.__getattribute__, physjax.__all__)):
-        yield from ((thing, f"{module.__name__.rpartition('.')[2]}.{name}") for name, thing in offered(module))
+    """All that a user can name, each thing once: under the first, which is the shortest, of its names."""
+    modules = [thing for name in physjax.__all__ if isinstance(thing := getattr(physjax, name), ModuleType)]
+    parts = {name: part for name, part in vars(Trajectory).items() if not name.startswith("_") and inspect.getdoc(part)}
+    offers = {f"{module.__name__.rpartition('.')[2]}.": offered(module) for module in modules}
+    offers = {"": offered(physjax), "Trajectory.": parts.items()} | offers
+    names = {}
+    for prefix, offer in offers.items():
+        for name, thing in offer:
+            names.setdefault(thing, prefix + name)
+    return {name: thing for thing, name in names.items()}
 
 
-NAMES = {name: thing for thing, name in reversed({thing: name for thing, name in reversed(list(public()))}.items())}
+NAMES = public()
 
 
 def run(name, docstring, names):

@@ -40,8 +40,9 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.impact)
         >>> falling = Scene(Particles(jnp.array([0.0, 1.0]), jnp.array([0.0, -2.0])), contacts=(floor,))
-        >>> print(falling.step(methods.euler, 0.0, 1.0).state.position)
-        [0.  0.5]
+        >>> end = falling.step(methods.euler, 0.0, 1.0).state
+        >>> print(end.position, end.velocity)
+        [0.  0.5] [0. 1.]
     """
     walls = _walls(scene)
     since = tuple(wall.touching_since for wall in walls)
