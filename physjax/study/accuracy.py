@@ -24,7 +24,11 @@ from physjax.stepping.methods import METHODS, rk4
 from physjax.stepping.reference import default_solver, in_dtype, reference, solve_ode
 from physjax.stepping.simulate import sample
 from physjax.study.energy import Conserved
+from physjax.study.limits import name_of
+from physjax.study.norms import energy, final, momentum, outcome, path, penetration
 from physjax.study.problem import Problem
+from physjax.study.recommend import recommend
+from physjax.study.running import answers_late, depends_on_velocity, evaluations, promised_order, smallest_size
 from physjax.study.work_precision import Run, WorkPrecision
 from physjax.vectors import scale
 
@@ -102,18 +106,18 @@ def work_precision(
         runs = []
         treatments = _treatments(scene)
         for method in methods:
-            progress(_name(method))
+            progress(name_of(method))
             for treatment, treated in treatments.items():
-                runs += _method_runs(problem, treated, method, _name(method) + treatment, dts, measure, budget)
+                runs += _method_runs(problem, treated, method, name_of(method) + treatment, dts, measure, budget)
         for solver in rivals:
             progress(f"diffrax {type(solver).__name__}")
             runs += _rival_runs(problem, scene, solver, tolerances, measure, budget)
-    velocity_dependent = _depends_on_velocity(problem.scene)
+    velocity_dependent = depends_on_velocity(problem.scene)
     return WorkPrecision(
         name=name,
         runs=tuple(runs),
         promised={
-            _name(method) + treatment: _promised_order(method, velocity_dependent, treated)
+            name_of(method) + treatment: promised_order(method, velocity_dependent, treated)
             for method in methods
             for treatment, treated in treatments.items()
         },
@@ -123,7 +127,7 @@ def work_precision(
         conserved=tuple(quantity.name for quantity in problem.conserved),
         dtype=np.dtype(dtype).name,
         path=(_detailed(problem), path.position),
-        scattered=_answers_late(problem.scene),
+        scattered=answers_late(problem.scene),
     )
 
 
@@ -180,7 +184,7 @@ def _truth(problem: Problem) -> tuple[Any, float, str]:
         return problem.exact(times), 0.0, "closed form"
     if not problem.is_ode:
         return _fine_path(problem)
-    size = _smallest_size(problem.scene)
+    size = smallest_size(problem.scene)
     tolerance = {"rtol": 1e-13, "atol": 1e-13 * size}
     path = reference(problem.scene, times, **tolerance)
     # the same tolerance with longer steps, which need not land on the moments between: the difference is their error
@@ -193,7 +197,7 @@ def _fine_path(problem: Problem) -> tuple[Any, float, str]:
     """The path by rk4 with fine steps; its error is estimated by longer ones, which end at other moments."""
     scene, frames = in_dtype(problem.scene, jnp.float64), problem.frames * DETAIL
     run = lambda count: sample(scene, as_module(rk4), problem.duration / (frames * count), count, frames=frames)  # noqa: E731
-    finer = LATE if _answers_late(scene) else 1
+    finer = LATE if answers_late(scene) else 1
     path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(finer * count))) for count in (FINE, COARSER))
     return (
         path,
@@ -220,16 +224,14 @@ def _method_runs(problem, scene, method, name, dts, measure, budget):
     started = time.perf_counter()
     compiled = sample.lower(scene, module, dt, jnp.asarray(1), frames=problem.frames).compile()
     compile_seconds = time.perf_counter() - started
-    evaluations = _evaluations(method, scene)
+    each = evaluations(method, scene)
     runs = []
     for count in _counts(problem, dts, budget):
         h = jnp.asarray(problem.duration / (problem.frames * count), scene.state.dtype)
         states, seconds = _timed(partial(compiled, scene, module, h, jnp.asarray(count)), budget)
         steps = count * problem.frames
         final, path, drifts = measure(states)
-        runs.append(
-            Run(name, float(h), None, steps, evaluations * steps, *seconds, compile_seconds, final, path, drifts)
-        )
+        runs.append(Run(name, float(h), None, steps, each * steps, *seconds, compile_seconds, final, path, drifts))
         if dts is None and (seconds[0] > budget.seconds or _at_rounding(runs)):
             break
     return runs
@@ -237,7 +239,7 @@ def _method_runs(problem, scene, method, name, dts, measure, budget):
 
 def _rival_runs(problem, scene, solver, tolerances, measure, budget):
     """A diffrax solver with adaptive steps, from loose to tight tolerance; one compilation."""
-    size = _smallest_size(scene)
+    size = smallest_size(scene)
     times = jnp.asarray(problem.times, scene.state.dtype)
     arguments = lambda tol: (scene, times, times[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
     started = time.perf_counter()
@@ -306,71 +308,20 @@ def default_rivals() -> tuple:
     return diffrax.Tsit5(), default_solver()
 
 
-def _smallest_size(scene: Scene) -> float:
-    """Typical size of the smaller of position and velocity: what an absolute tolerance is measured by."""
-    leaves = jax.tree.leaves((scene.state, _driven(scene, scene.state)))
-    sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in leaves]
-    return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
-
-
-def _depends_on_velocity(scene: Scene) -> bool:
-    """Whether the forces look at the velocity: the promise of some methods depends on it."""
-    with jax.enable_x64(True):
-        scene = in_dtype(scene, jnp.float64)
-        rng = np.random.default_rng(0)
-        push = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * (1 + jnp.abs(leaf)), scene.state)
-        ends = (_driven(scene, scene.kick(scene.state, push, sign)) for sign in (1.0, -1.0))
-        return any(bool(jnp.any(a != b)) for a, b in zip(*map(jax.tree.leaves, ends), strict=True))
-
-
-@jax.jit  # one compilation instead of one for each operation
-def _driven(scene: Scene, state: Any) -> Any:
-    return state.driven(scene, jnp.zeros((), state.dtype))
-
-
-def _promised_order(method, velocity_dependent, scene):
-    """The order that a method promises for a scene; at most 1 where something is answered at the end of a step."""
-    promises = getattr(method, "promises", None)
-    if promises is None:
-        return float("nan")
-    order = float(promises.order_with_drag if velocity_dependent else promises.order)
-    return min(order, 1.0) if _answers_late(scene) else order
-
-
-def _answers_late(scene):
-    """Whether something that happens within a step is answered at its end: a touch that is projected, a spring that parts."""
-    late = any(contact.response is contacts.project for contact in scene.contacts)
-    return late or any(hasattr(force, "advance") for force in scene.forces)
-
-
-class _Counter(NamedTuple):
-    """A system that counts how often a method asks for the right-hand side."""
-
-    scene: Scene
-    calls: list
-
-    def rate(self, t, state):
-        self.calls.append(t)
-        return self.scene.rate(t, state)
-
-    def kick(self, state, rate, dt):
-        return self.scene.kick(state, rate, dt)
-
-    def drift(self, state, dt):
-        return self.scene.drift(state, dt)
-
-
-def _evaluations(method, scene):
-    """Force evaluations a step: promised, or counted for a method that promises nothing."""
-    if hasattr(method, "promises"):
-        return method.promises.evaluations
-    counter = _Counter(scene, [])
-    jax.eval_shape(lambda state: method(counter, jnp.zeros((), scene.state.dtype), state, 1.0), scene.state)
-    return len(counter.calls)
-
-
-def _name(method):
-    return getattr(method, "__name__", type(method).__name__)
-
-
-__all__ = ["QUICK", "THOROUGH", "TOLERANCES", "Budget", "Run", "WorkPrecision", "default_rivals", "work_precision"]
+__all__ = [
+    "QUICK",
+    "THOROUGH",
+    "TOLERANCES",
+    "Budget",
+    "Run",
+    "WorkPrecision",
+    "default_rivals",
+    "energy",
+    "final",
+    "momentum",
+    "outcome",
+    "path",
+    "penetration",
+    "recommend",
+    "work_precision",
+]
