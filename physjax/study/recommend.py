@@ -163,7 +163,9 @@ def recommend(
         truth = yardstick(problem, wanted=min(errors), seconds=seconds / 5, push=push)
         question = Question(problem, truth, norm, scale, push, deadline)
         doubt = float(truth.doubt(norm, scale).max())
-        found, untried = _explored_all(question, _candidates(scene, methods), min(errors), bar)
+        found, untried = _explored_all(
+            question, candidates(scene) if methods is None else list(methods), min(errors), bar
+        )
         answers, compiled = [], {}
         for wanted in errors:
             bar.set_postfix_str(f"error {wanted:g}")
@@ -198,10 +200,8 @@ def _push(scene: Scene) -> Any:
     return Particles(np.zeros_like(random), random * free)
 
 
-def _candidates(scene: Scene, methods: Sequence[Callable] | None) -> list[Callable]:
-    """The methods in the order in which they are tried: what is likely to win first, what cannot win not at all."""
-    if methods is not None:
-        return list(methods)
+def candidates(scene: Scene) -> list[Callable]:
+    """Methods for a scene in the order in which they are tried: what is likely to win first, what cannot win not at all."""
     late, pulled = answers_late(scene), depends_on_velocity(scene)
 
     def merit(method):

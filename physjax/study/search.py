@@ -127,13 +127,23 @@ def tried(question: Question, entry: Contender, fineness: float) -> Trial:
     return Trial(exactly, question.error(jax.tree.map(np.asarray, found)), min(times))
 
 
-def explored(question: Question, entry: Contender, least: float, others: Sequence[Explored], start: float) -> Explored:
-    """Runs of a method from coarse to fine, until the least error is met, rounding stops it, or others are faster."""
+def explored(
+    question: Question,
+    entry: Contender,
+    least: float,
+    others: Sequence[Explored],
+    start: float,
+    longest: float = LONG,
+) -> Explored:
+    """Runs of a method from coarse to fine, until the least error is met, rounding stops it, or others are faster.
+
+    A run that takes `longest` [s] is the last.
+    """
     factor, fineness, trials = (TIGHTEN, 10.0, []) if entry.adaptive else (REFINE, start, [])
     while fineness <= FINEST and (not trials or question.left() > 0):
         trials.append(tried(question, entry, fineness))
         now = trials[-1]
-        if now.error <= 0.5 * least or now.seconds > LONG or _stuck(trials) or _beaten(now, others):
+        if now.error <= 0.5 * least or now.seconds > longest or _stuck(trials) or _beaten(now, others):
             break
         fineness *= factor
     return Explored(entry, tuple(trials))

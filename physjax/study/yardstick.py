@@ -5,6 +5,7 @@ far finer steps, whose last refinement tells how wrong it still is (Richardson).
 """
 
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -62,18 +63,19 @@ class Yardstick(NamedTuple):
 
 
 def yardstick(
-    problem: Problem, *, wanted: float = 1e-8, seconds: float = 3.0, push: Any = None, own: bool = False
+    problem: Problem, *, wanted: float = 1e-8, seconds: float = 3.0, push: Any = None, own: Callable | None = None
 ) -> Yardstick:
     """The true path of a problem at its moments, its doubt well below the error `wanted` if `seconds` [s] are enough.
 
     Inside `jax.enable_x64(True)`. Our own solution is refined until the last refinement changes it by less than a
-    fiftieth of what is wanted; with `own` it is used whatever else there is, for a second truth.
+    fiftieth of what is wanted; by `own`, a method, where given: for a second truth.
     """
     scene = in_dtype(problem.scene, jnp.float64)
-    if problem.exact is not None and push is None and not own:
+    if problem.exact is not None and push is None and own is None:
         states = problem.exact(problem.times)
         return Yardstick(scene, problem.times, states, None, None, None, "closed form")
-    solve = _by_diffrax(problem, push) if problem.is_ode and not own else _by_own(problem, wanted, seconds, push)
+    by_diffrax = problem.is_ode and own is None
+    solve = _by_diffrax(problem, push) if by_diffrax else _by_own(problem, own or rk4, wanted, seconds, push)
     states, second, slopes, source = solve(scene)
     return Yardstick(scene, problem.times, states, second, solve(nudged(scene, states))[0], slopes, source)
 
@@ -104,9 +106,9 @@ def _by_diffrax(problem: Problem, push: Any) -> Any:
     return solve
 
 
-def _by_own(problem: Problem, wanted: float, seconds: float, push: Any) -> Any:
-    """Our rk4, twice as fine again and again, until it no longer changes by what matters, or time is up."""
-    compiled = contender(problem, rk4, push=push)
+def _by_own(problem: Problem, method: Callable, wanted: float, seconds: float, push: Any) -> Any:
+    """Our own method, twice as fine again and again, until it no longer changes by what matters, or time is up."""
+    compiled = contender(problem, method, push=push)
     fineness = []  # of the first solution, which the nudged one shares
 
     def solve(scene):
@@ -125,7 +127,7 @@ def _by_own(problem: Problem, wanted: float, seconds: float, push: Any) -> Any:
         fineness.append(count)
         step = seconds_text(compiled.dt(count))
         states, slopes = runs[-1]
-        return states, _worse(problem, scene, runs), slopes, f"own rk4, step {step}, by Richardson"
+        return states, _worse(problem, scene, runs), slopes, f"own {compiled.name}, step {step}, by Richardson"
 
     return solve
 

@@ -59,7 +59,7 @@ def test_the_answer_prints_as_a_table_with_reason_and_evidence(swings):
 def test_a_random_scene_keeps_its_promise_against_another_reference():
     """Diffrax in the search, our own rk4 with fine steps here."""
     scene, horizon = random_scene(2)
-    other = yardstick(Problem(scene, horizon), wanted=1e-7, own=True)
+    other = yardstick(Problem(scene, horizon), wanted=1e-7, own=methods.rk4)
     assert other.doubt().max() < 1e-8
     for advice in recommend(scene, error=ERRORS, horizon=horizon, methods=FEW, progress=False):
         assert norms.path.error(other.scene, other.times, advice.simulate().state, other.states) <= advice.error
