@@ -38,7 +38,7 @@ from physjax.study import norms
 from physjax.study.accuracy import recommend
 from physjax.study.problem import Problem
 from physjax.study.recommend import candidates
-from physjax.study.running import contender, smallest_size
+from physjax.study.running import contender, copies, smallest_size
 from physjax.study.search import Question, explored, timed_in_turn
 from physjax.study.yardstick import yardstick
 
@@ -113,13 +113,12 @@ def judged(problem, other, doubt, advice, runs):
     return row
 
 
-def copies(scene, count):
+def crowd(scene, count):
     """So many of a scene, their velocities (of bodies, momenta) changed by a percent at random."""
     rng = np.random.default_rng(0)
-    many = lambda leaf: jnp.asarray(np.broadcast_to(np.asarray(leaf), (count, *leaf.shape)))  # noqa: E731
-    state = jax.tree.map(many, scene.state)
-    noise = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * jnp.abs(leaf), state)
-    return scene.having(state=scene.kick(state, noise, 0.01))
+    many = copies(scene, count)
+    noise = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * jnp.abs(leaf), many.state)
+    return many.having(state=scene.kick(many.state, noise, 0.01))
 
 
 def rivals(name):
@@ -127,7 +126,7 @@ def rivals(name):
     problem = problem_of(name)
     with jax.enable_x64(True):
         single = in_dtype(problem.scene, jnp.float64)
-        many = problem._replace(scene=copies(single, BATCH), exact=None)
+        many = problem._replace(scene=crowd(single, BATCH), exact=None)
         asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
         answers = recommend(many.scene, seconds=30, progress=False, **asked)
         truth = yardstick(many)

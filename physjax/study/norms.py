@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.scene import Scene
+from physjax.stepping.reference import in_dtype
 from physjax.study.energy import ENERGY, MOMENTUM, Conserved
 
 
@@ -63,8 +64,8 @@ def _over_time(function: Callable, scene: Scene, times: Any, states: Any) -> Any
 def _series(function: Callable, scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
     """A function of the state at every moment."""
     with jax.enable_x64(True):
-        states = jax.tree.map(jnp.asarray, states)
-        return np.asarray(_over_time(function, scene, jnp.asarray(times, states.dtype), states), float)
+        states = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), states)
+        return np.asarray(_over_time(function, in_dtype(scene, jnp.float64), jnp.asarray(times), states))
 
 
 def _kept(conserved: Conserved) -> Norm:

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from physjax.checks import positive_integer, real_quantity
-from physjax.particles import Particles, demand_particles
 from physjax.scene import Scene
 from physjax.show.report import seconds_text, table
 from physjax.stepping.methods import METHODS, adaptive, rk4
@@ -27,6 +26,7 @@ from physjax.study.running import (
     contender,
     depends_on_velocity,
     promised_order,
+    random_push,
     remembers,
     title_of,
 )
@@ -159,7 +159,7 @@ def recommend(
     deadline = time.perf_counter() + float(real_quantity("seconds [s]", seconds, above=0.0))
     with jax.enable_x64(True), _bar(progress) as bar:
         bar.set_postfix_str("the true path")
-        push = _push(scene) if gradient else None
+        push = random_push(scene) if gradient else None
         truth = yardstick(problem, wanted=min(errors), seconds=seconds / 5, push=push)
         question = Question(problem, truth, norm, scale, push, deadline)
         doubt = float(truth.doubt(norm, scale).max())
@@ -190,14 +190,6 @@ def _bar(progress: bool) -> Any:
     from tqdm import tqdm
 
     return tqdm(desc="recommend", unit="method", file=sys.stderr, disable=not progress, leave=False)
-
-
-def _push(scene: Scene) -> Any:
-    """A random change of the start's velocity, of length 1 in each component on average."""
-    demand_particles("gradient", scene.state, "what turns cannot be pushed by its velocity alone")
-    random = np.random.default_rng(0).normal(size=scene.state.position.shape)
-    free = 1.0 if scene.held is None else 1.0 - np.asarray(scene.held, float)[..., None]
-    return Particles(np.zeros_like(random), random * free)
 
 
 def candidates(scene: Scene) -> list[Callable]:

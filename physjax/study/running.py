@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from physjax.particles import Particles, demand_particles
 from physjax.physics import contacts
 from physjax.scene import Scene, as_module
 from physjax.stepping.adaptive import Adaptive
@@ -90,6 +91,24 @@ def _sample(scene: Scene, method: Any, dt: Any, count: Any, push: Any, frames: i
 
 
 _sampled = jax.jit(_sample, static_argnums=5)
+
+
+def random_push(scene: Scene) -> Any:
+    """A random change of the start's velocity, of length 1 in each component on average; held lanes stay."""
+    demand_particles("gradient", scene.state, "what turns cannot be pushed by its velocity alone")
+    random = np.random.default_rng(0).normal(size=scene.state.position.shape)
+    free = 1.0 if scene.held is None else 1.0 - np.asarray(scene.held, float)[..., None]
+    return Particles(np.zeros_like(random), random * free)
+
+
+def copies(scene: Scene, count: int) -> Scene:
+    """So many of a scene at once, along a new leading axis of its state."""
+    many = lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape))  # noqa: E731
+    state = jax.tree.map(many, scene.state)
+    memory = lambda contact: jax.tree.map(  # noqa: E731
+        lambda leaf, changes: many(leaf) if changes else leaf, contact, contact.changes()
+    )
+    return scene.having(state=state, contacts=tuple(memory(contact) for contact in scene.contacts))
 
 
 def title_of(method: Callable) -> str:

@@ -43,8 +43,9 @@ class Yardstick(NamedTuple):
     source: str
 
     def doubt(self, norm: Norm = path, scale: Any = None) -> np.ndarray:
-        """How far the truth itself may be wrong at each moment, `(moments,)`."""
-        return self._apart(self.second, norm, scale)
+        """How far the truth itself may be wrong at each moment, `(moments,)`; 0 for a closed form."""
+        # where moments are close the two take the same steps: an error of the tolerance is then what grows
+        return np.maximum(self._apart(self.second, norm, scale), TIGHT * self.growth(norm, scale))
 
     def growth(self, norm: Norm = path, scale: Any = None) -> np.ndarray:
         """How many times larger a small error of the start has become at each moment; 1: it moves along."""
