@@ -61,16 +61,23 @@ def problem_of(name):
 def promises(name):
     """One search for three errors, its promises checked, its runs against the fastest of an exhaustive search."""
     problem = problem_of(name)
-    started = time.perf_counter()
+    started, busy = time.perf_counter(), time.process_time()
     answers = recommend(problem.scene, error=ERRORS, horizon=problem.duration, frames=problem.frames, progress=False)
-    seconds = time.perf_counter() - started
+    seconds, busy = time.perf_counter() - started, time.process_time() - busy
     with jax.enable_x64(True):
         second = methods.rk4 if problem.is_ode else methods.verlet
         other = yardstick(problem, wanted=1e-7, seconds=6.0, own=None if problem.exact is not None else second)
         doubt = float(other.doubt().max())
         runs = exhaustive(problem, answers)
         rows = [judged(problem, other, doubt, advice, runs) for advice in answers]
-    return {"seconds": seconds, "truth": answers[0].truth, "other": other.source, "doubt": doubt, "answers": rows}
+    return {
+        "seconds": seconds,
+        "busy": busy,
+        "truth": answers[0].truth,
+        "other": other.source,
+        "doubt": doubt,
+        "answers": rows,
+    }
 
 
 def exhaustive(problem, answers):
@@ -80,7 +87,7 @@ def exhaustive(problem, answers):
         entries = candidates(problem.scene)[:3]
     slowest = max((a.best.seconds * problem.duration for a in answers if a.ok), default=0.1)
     truth = yardstick(problem._replace(exact=None), wanted=min(ERRORS))
-    question = Question(problem, truth, norms.path, None, None, time.perf_counter() + 60)
+    question = Question(problem, truth, norms.path, None, None, time.process_time() + 30)
     runs = []
     for method in entries:
         entry = contender(problem, method)
@@ -199,13 +206,13 @@ def report(record, folder, quick):
     checked = [row["kept"] for _, row in kept if row["checked"]]
     ratios = [row["ratio"] for _, row in kept if "ratio" in row]
     against = [(name, row) for name, r in record["rivals"].items() for row in r["rows"] if "times" in row]
-    searches = [r["seconds"] for r in record["promises"].values()]
+    searches = [r["busy"] for r in record["promises"].values()]
     bars = [
         Bar("promises kept, of those checked", float(np.mean(checked or [np.nan])), ">=", 0.98),
         Bar(
             "recommended within 1.5x of the fastest", float(np.mean(np.array(ratios or [np.nan]) <= WITHIN)), ">=", 0.9
         ),
-        Bar("longest search [s]", max(searches, default=np.nan), "<=", 20.0),
+        Bar("longest search [s of processor time]", max(searches, default=np.nan), "<=", 20.0),
         Bar(
             "at least as fast as diffrax", float(np.mean([r["times"] >= 1 for _, r in against] or [np.nan])), ">=", 1.0
         ),

@@ -151,12 +151,12 @@ def recommend(
     adaptive rk4, unless given; those that promise no more than another in any respect are left out, adaptive ones also
     where touches are answered at the end of a step, implicit ones where no error leaves the step to stability. With
     `gradient` the derivative of the path by the start's velocity, in a random direction, must keep the error as well,
-    and its time by forward mode counts. `seconds` bounds the search: what is not reached is said. Raises ValueError or
-    TypeError for bad input; where nothing keeps the error, the answer says what stops it.
+    and its time by forward mode counts. `seconds` of processor time bound the search: what is not reached is said.
+    Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
     """
     problem, errors = _asked(scene, error, horizon, frames)
     norm, dtypes = as_norm(norm), [np.dtype(dtype).name for dtype in dtypes]
-    deadline = time.perf_counter() + float(real_quantity("seconds [s]", seconds, above=0.0))
+    deadline = time.process_time() + float(real_quantity("seconds [s]", seconds, above=0.0))
     with jax.enable_x64(True), _bar(progress) as bar:
         bar.set_postfix_str("the true path")
         push = random_push(scene) if gradient else None
@@ -221,10 +221,10 @@ def _explored_all(question: Question, methods: Sequence, least: float, bar: Any)
         if found and 2 * longest > question.left():
             untried.append(name)
             continue
-        started = time.perf_counter()
+        started = time.process_time()
         entry = contender(question.problem, method, push=question.push)
         found.append(explored(question, entry, least, found, _first(found, entry)))
-        longest = max(longest, time.perf_counter() - started)
+        longest = max(longest, time.process_time() - started)
         bar.update()
     return found, tuple(untried)
 
@@ -351,7 +351,8 @@ def _obstacle(question: Question, found: list[Explored], wanted: float, doubt: f
         return f"The true path itself is known only to {doubt:.1e}{why}; {wanted:g} cannot be promised."
     if least <= SURE["float64"] * wanted - doubt:
         return f"The rounding of float32 stops it: in float64 an error of {wanted:g} is kept. Allow it by dtypes."
-    return f"No method came below {least:.1e} in the time a run may take ({LONG:g} s); {wanted:g} was asked for."
+    ended = "of the search" if question.left() < 0 else f"a run may take ({LONG:g} s)"
+    return f"No method came below {least:.1e} in the time {ended}; {wanted:g} was asked for."
 
 
 __all__ = ["Choice", "Recommendation", "recommend"]

@@ -14,18 +14,20 @@ from physjax.study.yardstick import Yardstick
 
 REFINE, TIGHTEN = 2.0, 10.0
 """From one exploring run to the next: so many times the steps, so many times less tolerance."""
-SHORT, LONG = 5e-3, 2.0
-"""A run below this [s] is timed again, since clocks and caches blur it; one above ends an exploration."""
+SHORT, LONG = 20e-3, 2.0
+"""Runs are timed again up to this [s] together, since clocks and neighbours blur short ones; one above ends an exploration."""
 FINEST = 1e12
 """Of tolerances; below is rounding."""
 NEAR = 1.15
 """A step within this factor of the longest that would do is as good."""
-ROUNDS = 7
-"""Turns that finalists take."""
+ROUNDS, PATIENCE = 7, 0.3
+"""Turns that finalists take at least, and for how long [s]: what disturbs the machine comes in bursts."""
+GRACE = 5.0
+"""Beyond the deadline nothing is compiled; short runs may still settle an answer for so long [s]."""
 
 
 class Question(NamedTuple):
-    """What is asked of a run, and until when (`time.perf_counter`) there is time to answer it."""
+    """What is asked of a run, and until when (`time.process_time`) there is time to answer it."""
 
     problem: Problem
     truth: Yardstick
@@ -35,8 +37,8 @@ class Question(NamedTuple):
     deadline: float
 
     def left(self) -> float:
-        """Time left [s]."""
-        return self.deadline - time.perf_counter()
+        """Processor time left [s]."""
+        return self.deadline - time.process_time()
 
     def error(self, found: Any) -> float:
         """The error of a run; of what becomes of the push as well, if there is one."""
@@ -119,7 +121,7 @@ class Explored(NamedTuple):
 def tried(question: Question, entry: Contender, fineness: float) -> Trial:
     """Run a method once, and again where that was short."""
     times = []
-    while not times or (len(times) < 3 and times[-1] < SHORT):
+    while not times or (len(times) < 16 and sum(times) < SHORT):
         started = time.perf_counter()
         found = jax.block_until_ready(entry(fineness))
         times.append(time.perf_counter() - started)
@@ -140,7 +142,7 @@ def explored(
     A run that takes `longest` [s] is the last.
     """
     factor, fineness, trials = (TIGHTEN, 10.0, []) if entry.adaptive else (REFINE, start, [])
-    while fineness <= FINEST and (not trials or question.left() > 0):
+    while fineness <= FINEST and (not trials or question.left() > -GRACE):
         trials.append(tried(question, entry, fineness))
         now = trials[-1]
         if now.error <= 0.5 * least or now.seconds > longest or _stuck(trials) or _beaten(now, others):
@@ -175,11 +177,11 @@ def refined(question: Question, entry: Explored, goal: float, most: float) -> tu
         if not np.isfinite(guess):
             return entry, None
         known = any(abs(np.log(t.fineness / guess)) < 1e-9 for t in entry.trials)
-        if best is not None and (known or best.fineness / guess < NEAR or question.left() < 0):
+        if best is not None and (known or best.fineness / guess < NEAR or question.left() < -GRACE):
             return entry, best
         if known:  # the guess itself failed, and nothing finer is known: a little finer
             guess *= NEAR
-        if entry.seconds(guess) > most or question.left() < 0:
+        if entry.seconds(guess) > most or question.left() < -GRACE:
             return entry, None
         trials = sorted((*entry.trials, tried(question, entry.contender, guess)))
         entry = entry._replace(trials=tuple(trials))
@@ -189,7 +191,9 @@ def refined(question: Question, entry: Explored, goal: float, most: float) -> tu
 def timed_in_turn(finalists: Sequence[tuple[Contender, Trial]]) -> list[float]:
     """The least time of each finalist's run [s], all taking turns, so that whatever else the machine does meets all."""
     least = [trial.seconds for _, trial in finalists]
-    for _ in range(ROUNDS if len(finalists) > 1 else 2):
+    begun, rounds = time.perf_counter(), 0
+    while rounds < ROUNDS or time.perf_counter() - begun < PATIENCE:
+        rounds += 1
         for i, (entry, trial) in enumerate(finalists):
             started = time.perf_counter()
             jax.block_until_ready(entry(trial.fineness))

@@ -66,7 +66,7 @@ class Yardstick(NamedTuple):
 def yardstick(
     problem: Problem, *, wanted: float = 1e-8, seconds: float = 3.0, push: Any = None, own: Callable | None = None
 ) -> Yardstick:
-    """The true path of a problem at its moments, its doubt well below the error `wanted` if `seconds` [s] are enough.
+    """The true path of a problem at its moments, its doubt well below the error `wanted` if the processor has `seconds` [s].
 
     Inside `jax.enable_x64(True)`. Our own solution is refined until the last refinement changes it by less than a
     fiftieth of what is wanted; by `own`, a method, where given: for a second truth.
@@ -113,7 +113,7 @@ def _by_own(problem: Problem, method: Callable, wanted: float, seconds: float, p
     fineness = []  # of the first solution, which the nudged one shares
 
     def solve(scene):
-        runs, count, started = [], COARSE, time.perf_counter()
+        runs, count, started = [], COARSE, time.process_time()
         if fineness:
             runs.append(_run(compiled, scene, fineness[0]))
             return runs[0][0], None, None, ""
@@ -122,7 +122,7 @@ def _by_own(problem: Problem, method: Callable, wanted: float, seconds: float, p
             if len(runs) >= 3 and _settled(problem, scene, runs, wanted / 50):
                 break
             # the next takes twice as long as the last
-            if len(runs) >= 3 and 3 * (time.perf_counter() - started) > seconds:
+            if len(runs) >= 3 and 3 * (time.process_time() - started) > seconds:
                 break
             count = 2 * count + 1  # steps that never end where the coarser ones did
         fineness.append(count)
