@@ -102,13 +102,19 @@ def random_push(scene: Scene) -> Any:
 
 
 def copies(scene: Scene, count: int) -> Scene:
-    """So many of a scene at once, along a new leading axis of its state."""
+    """So many of a scene at once, along a new leading axis of its state and of every number that each lane has."""
     many = lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape))  # noqa: E731
-    state = jax.tree.map(many, scene.state)
-    memory = lambda contact: jax.tree.map(  # noqa: E731
-        lambda leaf, changes: many(leaf) if changes else leaf, contact, contact.changes()
-    )
-    return scene.having(state=state, contacts=tuple(memory(contact) for contact in scene.contacts))
+    lanes = scene.state.lanes
+    per_lane = lambda leaf: many(leaf) if lanes and eqx.is_array(leaf) and leaf.shape == lanes else leaf  # noqa: E731
+    # what couples lanes, such as springs, has numbers of its own that serve all scenes as they are
+    forces = [f if getattr(f, "couples", True) else jax.tree.map(per_lane, f) for f in scene.forces]
+    parts = {"mass": scene.mass, "pinned": scene.pinned, "contacts": scene.contacts}
+    wider = {name: jax.tree.map(per_lane, part) for name, part in parts.items() if part is not None}
+    wider["forces"] = tuple(forces)
+    if not lanes:
+        memory = lambda contact: jax.tree.map(lambda leaf, c: many(leaf) if c else leaf, contact, contact.changes())  # noqa: E731
+        wider["contacts"] = tuple(memory(contact) for contact in scene.contacts)
+    return scene.having(state=jax.tree.map(many, scene.state), **wider)
 
 
 def title_of(method: Callable) -> str:

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, contacts, forces, methods
+from physjax.scene import as_module
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
+from physjax.stepping.simulate import sample
 from physjax.study import accuracy
 from physjax.study.accuracy import Budget, work_precision
+from physjax.study.running import copies
 
 FEW = Budget(seconds=0.02, repeats=1, refinement=2.0)
 
@@ -266,6 +269,15 @@ def test_times_are_those_of_the_batch_and_errors_those_of_one(both_kinds):
     one, many = study(1), study(20_000)
     assert many.path_error == one.path_error
     assert many.seconds > 10 * one.seconds
+
+
+@pytest.mark.parametrize("name", ["oscillator", "kepler", "hanging_rope"])
+def test_copies_of_a_scene_move_as_it_does(name):
+    problem = SCENES[name]()
+    run = lambda scene: sample(scene, as_module(methods.euler), problem.duration / 640, jnp.asarray(2), frames=4)  # noqa: E731
+    one, many = run(problem.scene), run(copies(problem.scene, 3))
+    assert many.position.shape[1] == 3
+    np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
 
 
 def test_rivals_can_be_chosen():
