@@ -48,8 +48,8 @@ SURE = {"float64": 0.9, "float32": 0.6}
 """The part of an error that a run may have to be recommended; rounding differs from one compilation to the next."""
 KNOWN = 0.3
 """An error can be promised if the truth itself is right to this part of it."""
-FINALISTS = 3
-"""Methods that are verified and timed for an error, by what their runs predict."""
+FINALISTS, CLOSE = 3, 4.0
+"""Methods that are verified and timed for an error, by what their runs predict, if not so many times slower than others."""
 
 
 class Choice(NamedTuple):
@@ -256,7 +256,7 @@ def _kept(
         found[i], trial = refined(question, found[i], goals["float64"], min(most, 4 * LONG))
         if trial is None:
             continue
-        most = min(most, 2 * trial.seconds)
+        most = min(most, CLOSE * trial.seconds)
         if "float64" in dtypes:
             kept.append((found[i].contender, trial))
         if "float32" in dtypes and _worth_float32(question, wanted):

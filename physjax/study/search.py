@@ -145,7 +145,10 @@ def explored(
     while fineness <= FINEST and (not trials or question.left() > -GRACE):
         trials.append(tried(question, entry, fineness))
         now = trials[-1]
-        if now.error <= 0.5 * least or now.seconds > longest or _stuck(trials) or _beaten(now, others):
+        if now.error <= 0.5 * least or now.seconds > longest or _stuck(trials):
+            break
+        # where steps follow the state, loose tolerances say nothing of tight ones
+        if not entry.adaptive and _beaten(now, others):
             break
         fineness *= factor
     return Explored(entry, tuple(trials))
