@@ -177,7 +177,8 @@ def recommend(
 def _asked(scene: Scene, error: Any, horizon: float, frames: int) -> tuple[Problem, list[float]]:
     if not isinstance(scene, Scene):
         raise TypeError(f"recommend: got a {type(scene).__name__}, expected a Scene.")
-    errors = np.atleast_1d(np.asarray(real_quantity("error", error, above=0.0), float))
+    real_quantity("error", error, above=0.0)
+    errors = np.atleast_1d(np.asarray(error, float))  # as given: outside float64 an array has other numbers
     if errors.ndim != 1 or not errors.size:
         raise ValueError(f"error: got an array of shape {errors.shape}, expected a number or a list of them.")
     span = real_quantity("horizon [s]", horizon, above=0.0)
@@ -202,7 +203,7 @@ def candidates(scene: Scene) -> list[Callable]:
 
     chosen = []
     # what is implicit does not end by stability and costs more than its promise says: last
-    for method in sorted(METHODS.values(), key=lambda m: (np.isinf(m.promises.stable_to), *(-x for x in merit(m)))):
+    for method in sorted(METHODS.values(), key=lambda m: (_implicit(m), *(-x for x in merit(m)))):
         if not any(all(a >= b for a, b in zip(merit(other), merit(method), strict=True)) for other in chosen):
             chosen.append(method)
     return chosen if late else [*chosen[:2], adaptive(rk4), *chosen[2:]]
@@ -350,7 +351,12 @@ def _obstacle(question: Question, found: list[Explored], wanted: float, doubt: f
         why = f" ({cause} leave every method at first order)" if answers_late(scene) else ""
         return f"The true path itself is known only to {doubt:.1e}{why}; {wanted:g} cannot be promised."
     if least <= SURE["float64"] * wanted - doubt:
-        return f"The rounding of float32 stops it: in float64 an error of {wanted:g} is kept. Allow it by dtypes."
+        what = (
+            "no time was left to compile it in float32"
+            if _worth_float32(question, wanted)
+            else "float32 rounds too much"
+        )
+        return f"In float64 an error of {wanted:g} is kept, but {what}. Allow float64 by dtypes."
     ended = "of the search" if question.left() < 0 else f"a run may take ({LONG:g} s)"
     return f"No method came below {least:.1e} in the time {ended}; {wanted:g} was asked for."
 

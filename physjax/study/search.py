@@ -195,7 +195,7 @@ def timed_in_turn(finalists: Sequence[tuple[Contender, Trial]]) -> list[float]:
     """The least time of each finalist's run [s], all taking turns, so that whatever else the machine does meets all."""
     least = [trial.seconds for _, trial in finalists]
     begun, rounds = time.perf_counter(), 0
-    while rounds < ROUNDS or time.perf_counter() - begun < PATIENCE:
+    while finalists and (rounds < ROUNDS or time.perf_counter() - begun < PATIENCE):
         rounds += 1
         for i, (entry, trial) in enumerate(finalists):
             started = time.perf_counter()
