@@ -230,12 +230,17 @@ def report(record, folder, quick):
     harness.print_table(f"{BATCH} copies", ["", "ours", "[s]", "diffrax", "[s]", "times faster"], rows)
     stopped = [f"{label(n, r)}: {r['reason']}" for n, r in answers if not r["ok"]]
     print("\nNothing keeps the error:", *(stopped or ["-"]), sep="\n  ")
-    harness.print_bars(bars, quick)
-    record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
-    record["counted"] = {"scenes": len(searches), "answers": len(answers), "stopped": len(stopped)}
+    scenes, smooth = len(SCENES) + RANDOM, sum(problem_of(name).is_ode for name in SCENES)
+    partial = len(searches) < scenes or len(record["rivals"]) < smooth
+    done = f"{len(searches)} of {scenes} scenes, {len(record['rivals'])} of {smooth} beside diffrax"
+    print(f"\nDone so far: {done}. {'A part proves nothing of the whole.' if partial else ''}")
+    harness.print_bars(bars, quick or partial)
+    record["bars"] = [bar._asdict() | {"met": None if partial else bar.met} for bar in bars]
+    record["counted"] = {"done": done, "answers": len(answers), "stopped": len(stopped)}
     record["counted"] |= {"checked": len(checked), "timed": len(ratios), "against_diffrax": len(against)}
     if against:
-        draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, harness.caption(record["machine"]))
+        foot = f"{harness.caption(record['machine'])}; {done}"
+        draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, foot)
 
 
 def draw(path, kept, against, foot):
@@ -266,8 +271,9 @@ def draw(path, kept, against, foot):
     rival.set(xlabel=f"time of diffrax's best [ours], {BATCH} copies", xscale="log")
     rival.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     rival.set_title("right of the line ours is faster")
-    for ax, log in ((promise, True), (ratio, True), (rival, False)):
-        ax.set_yscale("log" if log else "linear")
+    for ax in (promise, ratio):
+        ax.set_yscale("log")
+    for ax in (promise, ratio, rival):
         ax.grid(color="0.92")
     promise.legend(frameon=False, fontsize=9)
     figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
