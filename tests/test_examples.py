@@ -12,35 +12,6 @@ from matplotlib import pyplot as plt
 import physjax
 from physjax import Trajectory
 
-TO_COME = {
-    "accuracy.Budget",
-    "accuracy.Run",
-    "accuracy.WorkPrecision",
-    "accuracy.default_rivals",
-    "accuracy.work_precision",
-    "emitters.Appearance",
-    "emitters.Birth",
-    "emitters.Box",
-    "emitters.Disc",
-    "emitters.Emitter",
-    "emitters.Look",
-    "emitters.Mesh",
-    "emitters.Point",
-    "emitters.Source",
-    "emitters.Sphere",
-    "fields.Attractor",
-    "fields.Flow",
-    "fields.Turbulence",
-    "fields.Vortex",
-    "plot.particles",
-    "rigid.Balls",
-    "rigid.Hull",
-    "rigid.Joints",
-    "rigid.Touch",
-    "rigid.hinge",
-}
-"""Names without an example."""
-
 
 def offered(module):
     """Public functions and classes of a module: what it lists or, where it lists nothing, what it defines."""
@@ -87,11 +58,7 @@ def stock():
     plt.close("all")
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in TO_COME])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_example_of(name, stock, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(name, inspect.getdoc(NAMES[name]), dict(stock))
-
-
-def test_every_name_that_is_to_come_lacks_its_example():
-    assert {name for name in TO_COME if ">>>" in inspect.getdoc(NAMES[name])} == set()

@@ -31,6 +31,13 @@ class Balls(Contact):
     that this never adds energy. Momentum is kept. Overlap is then taken away, the common centre of mass kept. First
     order in dt, with the step shared: take steps in which no ball moves more than a part of its radius. At most 64
     balls; no stacks.
+
+    Example:
+        >>> marble = inertia.sphere(1.0, 0.5)
+        >>> row = rigid.bodies(marble, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], velocity=[[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        >>> hit = Scene(row, marble, contacts=(rigid.Balls(0.5),)).step(methods.euler, 0.0, 0.01)
+        >>> print(hit.state.momentum[:, 0])
+        [0. 2.]
     """
 
     couples: ClassVar[bool] = True

@@ -28,7 +28,13 @@ _DRAWS = 8
 
 
 class Birth(NamedTuple):
-    """What is fixed when a particle is born: the moment [s], its life [s] and size [m], place [m] and velocity [m/s]."""
+    """What is fixed when a particle is born: the moment [s], its life [s] and size [m], place [m] and velocity [m/s].
+
+    Example:
+        >>> first = fountain.births(slot=jnp.array([0]), generation=jnp.array([0]))
+        >>> isinstance(first, emitters.Birth), first.velocity.tolist()
+        (True, [[0.0, 5.0]])
+    """
 
     time: Float[Array, "*births"]
     life: Float[Array, "*births"]
@@ -50,6 +56,11 @@ class Emitter(eqx.Module):
     again before its particle has died is an error that names the pool needed; with `drop_oldest` the oldest makes way.
     Time is that of the state's type: float32 counts 16 million births, and tells births apart while rate·eps·t < 1.
     Raises ValueError or TypeError for numbers out of range.
+
+    Example:
+        >>> fountain = emitters.Emitter(8, emitters.Point((0.0, 0.0)), key=0, life=1.0, speed=5.0, rate=4.0)
+        >>> print(fountain.birth_time(slot=jnp.array([0, 1, 2]), generation=jnp.array([0, 0, 1])))
+        [0.   0.25 2.5 ]
     """
 
     memory: ClassVar[tuple[str, ...]] = ("generation", "born", "dies")

@@ -19,7 +19,16 @@ from physjax.vectors import components, cross, dot, norm, over, scale, stacked, 
 
 
 class Flow(Force):
-    """Air that moves: F = b u(t, x), to be added to `StokesDrag(b)`."""
+    """Air that moves: F = b u(t, x), to be added to `StokesDrag(b)`.
+
+    Example:
+        >>> class Wind(fields.Flow):
+        ...     coefficient: float
+        ...     def flow(self, t, position):
+        ...         return jnp.full_like(position, 4.0)
+        >>> print(Wind(0.5)(0.0, ball, shot.mass))
+        [2. 2.]
+    """
 
     @abstractmethod
     def flow(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
@@ -37,6 +46,12 @@ class Turbulence(Flow):
     half to one and a half of 2π/size, and turn over as fast as they pass, ωᵢ = |kᵢ| speed. A few random Fourier `modes`
     after R. H. Kraichnan, "Diffusion by a random velocity field", Phys. Fluids 13 (1970) 22. `key` is a seed or a
     `jax.random.key`; `dim` 2 or 3.
+
+    Example:
+        >>> eddies = fields.Turbulence(coefficient=1.0, speed=2.0, size=0.5, key=0, dim=2)
+        >>> slopes = jax.jit(jax.jacfwd(lambda x: eddies.flow(0.0, x)))(ball.position)
+        >>> bool(abs(slopes[0, 0] + slopes[1, 1]) < 1e-4)
+        True
     """
 
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
@@ -77,6 +92,11 @@ class Vortex(Flow):
     """A whirl about an axis, Lamb and Oseen's: u = Γ/(2πr)·(1 - exp(-r²/c²)) around, a solid turn within its core c [m].
 
     `circulation` Γ [m²/s] turns anticlockwise about the `axis`, a vector in space; in the plane there is none to give.
+
+    Example:
+        >>> whirl = fields.Vortex(coefficient=1.0, circulation=20.0 * np.pi, core=0.1, center=(0.0, 0.0))
+        >>> print(whirl(0.0, ball, shot.mass))
+        [-1.  0.]
     """
 
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
@@ -107,6 +127,11 @@ class Attractor(Field):
     """A centre that draws all masses alike: a = -μ d/(d² + ε²)^(3/2), d from the `center` [m]; μ [m³/s²] is its GM.
 
     The `softening` ε [m] (Plummer's) keeps what passes through the centre finite.
+
+    Example:
+        >>> sun = fields.Attractor(strength=1000.0, softening=1e-3, center=(0.0, 0.0))
+        >>> print(sun.acceleration(0.0, ball, shot.mass))
+        [ -0. -10.]
     """
 
     strength: Float[Array, "..."] = quantity("strength μ", "m³/s²")

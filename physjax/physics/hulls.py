@@ -33,6 +33,10 @@ class Hull(eqx.Module):
     """Points of a body [m], in its frame from its centre of mass, each with a `radius` [m] around it.
 
     `points` are `(points, 3)`, or `(*lanes, points, 3)` where bodies differ; `radius` is a scalar or per lane.
+
+    Example:
+        >>> rigid.Hull.box((1.0, 2.0, 3.0)).points.shape
+        (8, 3)
     """
 
     points: Float[Array, "*lanes points 3"]
@@ -86,6 +90,11 @@ class Touch(Contact):
 
     Only points touch: the edge of a box passes through a ball that is a surface, and through a kerb. Bodies do not
     hang on a pivot.
+
+    Example:
+        >>> touch = rigid.Touch(rigid.Hull.sphere(0.5), contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+        >>> float(touch.gap(0.0, jnp.array([0.0, 2.0, 0.0])))
+        1.5
     """
 
     hull: Hull

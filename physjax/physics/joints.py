@@ -21,6 +21,11 @@ class Joints(Load):
     the two bodies, from their centres of mass. Stiffness k [N/m] and damping c [kg/s] are one for all. A hinge is two
     ball joints on its axis: see `hinge`. The points part by about load/k, which `error` tells; a step must resolve
     √(m/k) of the lightest body: the lighter and the smaller, the stiffer.
+
+    Example:
+        >>> arm = rigid.Joints([(0, 1)], [[[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]], stiffness=1e3)
+        >>> print(arm.error(rigid.bodies(brick, [[0.0, 0.0, 0.0], [1.25, 0.0, 0.0]])))
+        [0.25]
     """
 
     couples: ClassVar[bool] = True
@@ -95,6 +100,11 @@ def hinge(pair: tuple[int, int], points: Any, axis: Any, width: float) -> tuple[
     """Pairs and points of a hinge for `Joints`: two ball joints a `width` [m] apart on an axis that both bodies share.
 
     `points` `(2, 3)` is its middle in each body's frame, `axis` its direction in both frames, or `(2, 3)`, one in each.
+
+    Example:
+        >>> pairs, points = rigid.hinge((0, 1), [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], axis=(0.0, 0.0, 1.0), width=0.5)
+        >>> pairs, points.shape
+        ([(0, 1), (0, 1)], (2, 2, 3))
     """
     points, axis = np.broadcast_to(points, (2, 3)), np.broadcast_to(axis, (2, 3))
     size = np.sqrt(np.sum(axis * axis, axis=-1, keepdims=True))

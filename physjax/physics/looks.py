@@ -10,7 +10,13 @@ from physjax.checks import concrete, demand, quantity
 
 
 class Appearance(NamedTuple):
-    """Who is seen, how large [m], in which colour (red, green, blue from 0 to 1), and how opaque (0 to 1; 0 of the dead)."""
+    """Who is seen, how large [m], in which colour (red, green, blue from 0 to 1), and how opaque (0 to 1; 0 of the dead).
+
+    Example:
+        >>> seen = jet.final_scene.emitter.appearance(0.9)
+        >>> isinstance(seen, emitters.Appearance), int(seen.alive.sum())
+        (True, 4)
+    """
 
     alive: Bool[Array, "*lanes"]
     size: Float[Array, "*lanes"]
@@ -23,6 +29,10 @@ class Look(eqx.Module):
 
     `size` multiplies the size a particle was born with; `colour` is `(knots, 3)`. `glows` says that the light of
     particles adds up, as fire's does, instead of one covering another. Raises ValueError for other shapes or numbers.
+
+    Example:
+        >>> emitters.Look(opacity=(1.0, 0.0)).opacity.tolist()
+        [1.0, 0.0]
     """
 
     size: Float[Array, "knots"] = quantity("size over life", "1", at_least=0, default=(1.0, 1.0))

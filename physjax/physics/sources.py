@@ -17,7 +17,12 @@ from physjax.vectors import components, cross, norm, over, scale, stacked, turn_
 
 
 class Source(eqx.Module):
-    """A shape that particles are born from."""
+    """A shape that particles are born from.
+
+    Example:
+        >>> isinstance(emitters.Point((0.0, 0.0)), emitters.Source)
+        True
+    """
 
     @property
     @abstractmethod
@@ -30,7 +35,13 @@ class Source(eqx.Module):
 
 
 class Point(Source):
-    """All from one point; outward is any direction, all equally likely."""
+    """All from one point; outward is any direction, all equally likely.
+
+    Example:
+        >>> place, outward = emitters.Point((1.0, 2.0))(jnp.array([0.1, 0.2, 0.3]))
+        >>> print(place)
+        [1. 2.]
+    """
 
     at: Float[Array, "dim"] = quantity("place of the source", "m")
 
@@ -46,7 +57,14 @@ class Point(Source):
 
 
 class Disc(Source):
-    """Evenly from a disc of a radius [m] across `normal`; in the plane, from a line as long as its diameter."""
+    """Evenly from a disc of a radius [m] across `normal`; in the plane, from a line as long as its diameter.
+
+    Example:
+        >>> disc = emitters.Disc((0.0, 0.0, 0.0), normal=(0.0, 0.0, 2.0), radius=2.0)
+        >>> place, outward = disc(jnp.array([0.25, 0.0, 0.0]))
+        >>> print(jnp.hypot(place[0], place[1]), outward)
+        1.0 [0. 0. 1.]
+    """
 
     center: Float[Array, "dim"] = quantity("center of the disc", "m")
     normal: Float[Array, "dim"] = quantity("normal of the disc", "1")
@@ -68,7 +86,13 @@ class Disc(Source):
 
 
 class Box(Source):
-    """Evenly from all of a box between two corners [m]; outward is any direction, all equally likely."""
+    """Evenly from all of a box between two corners [m]; outward is any direction, all equally likely.
+
+    Example:
+        >>> place, outward = emitters.Box((0.0, 0.0), (2.0, 4.0))(jnp.array([0.5, 0.25, 0.0]))
+        >>> print(place)
+        [1. 1.]
+    """
 
     lower: Float[Array, "dim"] = quantity("lower corner", "m")
     upper: Float[Array, "dim"] = quantity("upper corner", "m")
@@ -92,7 +116,13 @@ class Box(Source):
 
 
 class Sphere(Source):
-    """Evenly from a ball of a radius [m], in the plane a disc; with `shell=True` from its surface alone."""
+    """Evenly from a ball of a radius [m], in the plane a disc; with `shell=True` from its surface alone.
+
+    Example:
+        >>> place, outward = emitters.Sphere((0.0, 0.0, 0.0), radius=2.0, shell=True)(jnp.array([0.1, 0.2, 0.3]))
+        >>> print(place / outward)
+        [2. 2. 2.]
+    """
 
     center: Float[Array, "dim"] = quantity("center", "m")
     radius: Float[Array, ""] = quantity("radius", "m", at_least=0)
@@ -114,6 +144,12 @@ class Mesh(Source):
     """Evenly from the surface of a triangle mesh: `vertices` `(n, 3)` [m], `faces` `(m, 3)`; outward by their winding.
 
     Raises ValueError for other shapes and for faces that name no vertex.
+
+    Example:
+        >>> triangle = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        >>> place, outward = emitters.Mesh(triangle, np.array([[0, 1, 2]]))(jnp.array([0.5, 0.25, 0.5]))
+        >>> print(place, outward)
+        [0.5  0.25 0.  ] [0. 0. 1.]
     """
 
     vertices: Float[Array, "1 n 3"]

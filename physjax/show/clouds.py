@@ -50,6 +50,11 @@ def particles(film: Any, *, frames: Any = None, figure: Any = None) -> Any:
     """Draw particles at some `frames` (by default three, the last of them the end): size, colour and opacity by age.
 
     Returns the figure. Raises TypeError or ValueError for a run without positions or without an emitter.
+
+    Example:
+        >>> figure = plot.particles(jet, frames=[5, 10])
+        >>> len(figure.axes)
+        2
     """
     who = "plot.particles"
     seen, draw = cloud_of(who, film)

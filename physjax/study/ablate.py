@@ -141,6 +141,12 @@ def ablate(
     below the numerical error, estimated by runs with shorter steps, is none. Times are the least of several, all runs
     in turn, within some `seconds` [s]; a difference within the timer's spread is none, 0 times nothing. Compiles each
     variant twice. Raises ValueError or TypeError for bad input.
+
+    Example:
+        >>> height = lambda flight: flight.position[-1, 1]
+        >>> told = accuracy.ablate(shot, height, method=methods.verlet, dt=0.1, duration=2.0, seconds=0.1)
+        >>> round(float(told["Gravity"].change), 3), told["Gravity"].verdict
+        (19.6, 'needed')
     """
     if not callable(outcome):
         raise TypeError(f"outcome: got {outcome!r}, expected a function of the run, e.g. lambda f: f.position[-1, 0].")

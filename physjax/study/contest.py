@@ -25,7 +25,12 @@ from physjax.vectors import scale
 
 
 class Budget(NamedTuple):
-    """How long a study may take: refine a step until one run costs `seconds`, time each run `repeats` times."""
+    """How long a study may take: refine a step until one run costs `seconds`, time each run `repeats` times.
+
+    Example:
+        >>> accuracy.Budget(seconds=0.2)
+        Budget(seconds=0.2, repeats=5, refinement=1.5)
+    """
 
     seconds: float = 0.05
     repeats: int = 5

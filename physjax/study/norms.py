@@ -106,7 +106,12 @@ penetration = Norm("penetration", partial(_series, _depth), extent)
 
 
 def outcome(function: Callable, name: str | None = None) -> Norm:
-    """What you look at: `function(times, states) -> number or array`; its error in parts of its own largest value."""
+    """What you look at: `function(times, states) -> number or array`; its error in parts of its own largest value.
+
+    Example:
+        >>> accuracy.outcome(lambda times, states: states.position[-1, 0], name="where it lands").name
+        'where it lands'
+    """
     if not callable(function):
         raise TypeError(f"outcome: got {function!r}, expected a function (times, states) -> what you look at.")
 

@@ -153,6 +153,13 @@ def recommend(
     `gradient` the derivative of the path by the start's velocity, in a random direction, must keep the error as well,
     and its time by forward mode counts. `seconds` of processor time bound the search: what is not reached is said.
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
+
+    Example:
+        >>> advice = accuracy.recommend(
+        ...     swing, error=1e-3, horizon=2.0, methods=[methods.verlet], dtypes=[np.float64], seconds=1.0, progress=False
+        ... )
+        >>> advice.best.name, advice.best.error < 1e-3
+        ('verlet', True)
     """
     problem, errors = _asked(scene, error, horizon, frames)
     norm, dtypes = as_norm(norm), [np.dtype(dtype).name for dtype in dtypes]
