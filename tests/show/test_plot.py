@@ -98,7 +98,8 @@ def test_table_is_aligned():
 
 
 @pytest.mark.parametrize(
-    ("seconds", "text"), [(3e-6, "3 µs"), (0.0123, "12.3 ms"), (2.5, "2.5 s"), (86400 * 10, "10 d")]
+    ("seconds", "text"),
+    [(0.99999994, "1 s"), (3e-6, "3 µs"), (0.0123, "12.3 ms"), (2.5, "2.5 s"), (86400 * 10, "10 d")],
 )
 def test_times_are_readable(seconds, text):
     assert report.seconds_text(seconds) == text
