@@ -151,11 +151,11 @@ def ablate(
     if not callable(outcome):
         raise TypeError(f"outcome: got {outcome!r}, expected a function of the run, e.g. lambda f: f.position[-1, 0].")
     checked_method(method)
-    step = float(real_quantity("dt [s]", dt, above=0.0))
+    real_quantity("dt [s]", dt, above=0.0)  # used as given: a Python 0.01 divides 5 s, the float32 next to it does not
     error, seconds = (
         float(real_quantity(name, value, at_least=0.0)) for name, value in (("error", error), ("seconds [s]", seconds))
     )
-    run = partial(_outcomes, outcome, method, step, duration, save_every)
+    run = partial(_outcomes, outcome, method, dt, duration, save_every)
     progress("everything")
     flight, value, uncertain = run(Removal("everything", scene))
     found, notes = removals(scene, flight, lanes or {})
@@ -167,15 +167,15 @@ def ablate(
         measured.append(run(removal)[1:])
     scenes = [scene, *(removal.scene for removal in found)]
     progress("times")
-    times = _times([partial(_run, s, method, step, flight.steps, save_every) for s in scenes], seconds)
+    times = _times([partial(_run, s, method, dt, flight.steps, save_every) for s in scenes], seconds)
     matters = np.broadcast_to(error * np.abs(value if scale is None else np.asarray(scale, float)), value.shape)
     names = ["everything", *(removal.name for removal in found)]
-    costs = [_cost(one, method, step) for one in scenes]
+    costs = [_cost(one, method, dt) for one in scenes]
     effects = [
         _effect(*each, whole=measured[0], clock=times[0], matters=matters)
         for each in zip(names, measured, times, costs, strict=True)
     ]
-    return Ablation(effects[0], tuple(effects[1:]), matters, name_of(method), step, tuple(notes))
+    return Ablation(effects[0], tuple(effects[1:]), matters, name_of(method), float(dt), tuple(notes))
 
 
 def _effect(

@@ -1,5 +1,6 @@
 """What each part of a model is worth, where the true worth is known."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -112,6 +113,15 @@ def test_the_third_dimension_goes_where_nothing_needs_it():
     text = str(told)
     assert [word for word in ("not timed", "verdict", "Plane: friction") if word not in text] == []
     assert len(told.plot().axes) == 1
+
+
+def test_a_float32_program_counts_steps_as_simulate_does():
+    with jax.enable_x64(False):
+        ball = Scene(Particles(jnp.zeros(2), jnp.ones(2)), 0.1, (forces.Gravity(),))
+        run = {"method": methods.rk4, "dt": 0.01, "duration": 2.0, "save_every": 200, **UNTIMED}
+        told = accuracy.ablate(ball, lambda f: f.position[-1, 0], **run)
+    assert told.dt == 0.01
+    assert told["Gravity"].verdict == NONE  # it pulls across
 
 
 def test_the_third_dimension_stays_where_something_leaves_the_plane():
