@@ -116,17 +116,13 @@ def _shown(value: Any) -> str:
 
 def demand_legal(contact: Any, state: Any) -> None:
     """Raise a ValueError naming the lanes that start on the wrong side of a contact by more than rounding."""
-    gap = concrete(contact.gap(jnp.zeros((), state.dtype), state.position))
+    gap = concrete(contact.clearance(jnp.zeros((), state.dtype), state))
     if gap is None:
         return
     rounding = 8 * float(jnp.finfo(state.dtype).eps) * float(np.abs(np.asarray(state.position)).max())
     if (gap < -rounding).any():
         lanes = np.argwhere(gap < -rounding)
-        where = (
-            "the particle starts"
-            if not gap.ndim
-            else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
-        )
+        where = "it starts" if not gap.ndim else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
         raise ValueError(
             f"{type(contact).__name__}: {where} on the wrong side, {-gap.min():.3g} m deep; expected gaps >= 0. "
             "Move them, or put them on the surface: state = contact.respond(0.0, state)."

@@ -59,6 +59,7 @@ class Contact(eqx.Module):
     `memory` names the arrays that it changes.
     """
 
+    couples: ClassVar[bool] = False
     response: ClassVar[Callable | None] = None
     memory: ClassVar[tuple[str, ...]] = ()
 
@@ -74,7 +75,20 @@ class Contact(eqx.Module):
         """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
         return self
 
-    def prepared(self, state: Particles, couples: bool) -> "Contact":
+    def answered(self, t: ArrayLike, state: Any, mass: Any) -> Any:
+        """What `project` takes: `respond`, unless an answer needs the masses."""
+        return self.respond(t, state)
+
+    def clearance(self, t: ArrayLike, state: Any) -> Float[Array, "*lanes"]:
+        """How far each lane is from touching [m]."""
+        return self.gap(t, state.position)
+
+    def demand_fit(self, state: Any, mass: Any) -> None:
+        """Raise a TypeError for what cannot touch it, and a ValueError for lanes that start on the wrong side."""
+        demand_particles("contacts", state, "rigid bodies touch with rigid.Touch(hull, plane)")
+        demand_legal(self, state)
+
+    def prepared(self, state: Any, couples: bool) -> "Contact":
         """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
         return self
 
@@ -96,7 +110,7 @@ def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "S
     state = scene.state
     for contact in scene.contacts:
         if (contact.response or project) is project:
-            state = contact.respond(t + dt, state)
+            state = contact.answered(t + dt, state, scene.mass)
     return scene.having(state=state)
 
 
@@ -158,20 +172,18 @@ class Scene(eqx.Module):
         self.state = state
         self.mass = mass
         self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
-        contacts = [_part("contact", contact, dtype) for contact in _listed("contact", contacts)]
-        if contacts:
-            demand_particles("contacts", state, "nothing else touches yet")
-        for contact in contacts:
-            demand_legal(contact, state)
-        self.contacts = tuple(contact.prepared(state, self.couples) for contact in contacts)
+        self.contacts = tuple(_part("contact", contact, dtype) for contact in _listed("contact", contacts))
+        for contact in self.contacts:
+            contact.demand_fit(state, mass)
+        self.contacts = tuple(contact.prepared(state, self.couples) for contact in self.contacts)
         self.pinned = pinned
         self.reaction = None
         self.emitter = None if emitter is None else emitter.prepared(self)
 
     @property
     def couples(self) -> bool:
-        """Whether any force ties lanes together; a force that does not say counts as coupling."""
-        return any(getattr(force, "couples", True) for force in self.forces)
+        """Whether any force or contact ties lanes together; a force that does not say counts as coupling."""
+        return any(getattr(part, "couples", True) for part in (*self.forces, *self.contacts))
 
     @property
     def held(self) -> Bool[Array, "*lanes"] | None:

@@ -234,7 +234,7 @@ def in_world(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]
 
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
     """ω = R I⁻¹ Rᵀ L [rad/s], in the world's frame."""
-    return _answer(bodies, inertia, bodies.angular_momentum)
+    return answer(bodies, inertia, bodies.angular_momentum)
 
 
 def angular_acceleration(
@@ -242,7 +242,7 @@ def angular_acceleration(
 ) -> Float[Array, "*lanes 3"]:
     """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world's frame; the torque [N m] about the centre of mass, or the pivot."""
     gyroscopic = cross(angular_velocity(bodies, inertia), bodies.angular_momentum)
-    return _answer(bodies, inertia, torque - gyroscopic)
+    return answer(bodies, inertia, torque - gyroscopic)
 
 
 def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
@@ -295,7 +295,7 @@ def _seen(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
     return [number * part for number, part in parts]
 
 
-def _answer(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
-    """R I⁻¹ Rᵀ times a vector of the world."""
+def answer(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
+    """R I⁻¹ Rᵀ times a vector of the world: how a body turns in answer to an angular impulse."""
     frame = _principal_frame(bodies, inertia)
     return stacked(turned(frame, _seen(frame, inertia, vector)))

@@ -95,7 +95,7 @@ def _through_touches(
 
     def go_on(leg, _):
         more = any_lane(~leg.arrived)
-        return lax.cond(more, lambda: _where(leg.arrived, leg, _leg(motion, scene, leg, t, dt)), lambda: leg), None
+        return lax.cond(more, lambda: chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt)), lambda: leg), None
 
     leg, _ = lax.scan(go_on, leg, length=IMPACTS + 1)
     return leg.state, leg.since
@@ -110,7 +110,7 @@ def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
 
 def _begun(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> tuple[Array, Array, Held]:
     """When a leg begins, how much of the step is left, and what carries each lane through it."""
-    walls, begun, rest = _walls(scene), t + leg.elapsed, jnp.maximum(dt - leg.elapsed, _hair(dt))
+    walls, begun, rest = _walls(scene), t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
     here = scene.having(state=leg.state)
     start = apart(~leg.arrived, lambda: hold(here, walls, leg.since, begun, rest), nothing_held(here, walls, leg.since))
     return begun, rest, start
@@ -126,13 +126,13 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> 
     through = _Leg(leg.elapsed + rest, end, start.since, jnp.ones_like(leg.arrived))
 
     def touch():
-        duration = jnp.maximum(_moment(motion, held, start, meeting, begun, rest), _hair(dt))
+        duration = jnp.maximum(_moment(motion, held, start, meeting, begun, rest), hair(dt))
         touched = begun + duration
         at = apart(meeting.hit, lambda: motion(held, begun, duration).state, leg.state)
         state, since = apart(
             meeting.hit, lambda: _answer(held, start, meeting, touched, at, dt), (leg.state, leg.since)
         )
-        return _where(meeting.hit, _Leg(leg.elapsed + duration, state, since, leg.arrived), through)
+        return chosen(meeting.hit, _Leg(leg.elapsed + duration, state, since, leg.arrived), through)
 
     return lax.cond(any_lane(meeting.hit), touch, lambda: through)
 
@@ -165,7 +165,7 @@ def flights(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Ca
         begun, _, start = _begun(scene, leg, t, dt)
         held = carried(scene, _walls(scene), start)
         after = _where(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
-        duration = jnp.maximum(after.elapsed - leg.elapsed, _hair(dt))
+        duration = jnp.maximum(after.elapsed - leg.elapsed, hair(dt))
         end = motion(held, begun, duration).state
         return after, add(total, Flight(leg.state, held, begun, duration, end, after.state, ~leg.arrived))
 
@@ -176,7 +176,7 @@ def flights(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Ca
     return total, leg.state
 
 
-def _hair(dt: Array) -> Array:
+def hair(dt: Array) -> Array:
     """The shortest stretch of time: none is quite zero, so that a mean over it is still a mean."""
     return float(jnp.finfo(dt.dtype).eps) * dt
 
@@ -202,7 +202,7 @@ def _answer(
         weight = -(dot(acceleration, normal) + wall.bend(t, at.position, relative))
         rests = here & (2 * lift <= SHORTEST_FLIGHT * dt * weight) & ((wall.restitution < 1) | (lift == 0))
         touch = (wall.gap(t, at.position), normal, relative)
-        state = _where(here, rebound(wall, at, touch, inward, rests), state)
+        state = chosen(here, rebound(wall, at, touch, inward, rests), state)
         flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - wall.restitution), 1.0)
         since[i] = jnp.where(rests, t + flights, since[i])
     slides = [i for i, slip in enumerate(start.slip) if slip is not None]
@@ -210,7 +210,7 @@ def _answer(
         relative, before = walls[i].relative(at.velocity), walls[i].relative(start.state.velocity)
         slowed = dot(relative, relative) < 0.25 * dot(before, before)  # else it only turned
         stopped = Particles(at.position, at.velocity - relative)
-        state = _where(touches & (which == guard) & slowed, stopped, state)
+        state = chosen(touches & (which == guard) & slowed, stopped, state)
     bounced, kick = touches & (which < len(walls)), dot(acceleration, acceleration) * (dt * dt)
     for i, wall in enumerate(walls):
         # a bounce elsewhere throws a lane off what it touched, or into it: then that is a new touch
@@ -238,13 +238,13 @@ def _next_meeting(scene: Scene, start: Held, end: Particles, t: ArrayLike, dt: A
     scene, start, end = lax.stop_gradient((scene, start, end))
     walls, dips = _walls(scene), []
     for face, pressed in zip(_faces(walls, t, start.state), start.pressed, strict=True):
-        dip = _dip(face, t, dt, start.state, end)
+        dip = dip_of(face, t, dt, start.state, end)
         dips.append(dip._replace(last=jnp.where(pressed > 0, jnp.inf, dip.last)))
     for wall, slip in zip(walls, start.slip, strict=True):
         if slip is not None:
             before, after = (dot(wall.relative(state.velocity), slip) for state in (start.state, end))
             last = jnp.where((before > 0) & (after <= 0), 1.0, jnp.inf)
-            dips.append(_Dip(jnp.zeros_like(last), last, before, after))
+            dips.append(Dip(jnp.zeros_like(last), last, before, after))
     last = jnp.min(jnp.stack([dip.last for dip in dips]), axis=0)
     first = jnp.min(jnp.stack([jnp.where(dip.last <= 1, dip.first, jnp.inf) for dip in dips]), axis=0)
     above, below = jnp.zeros_like(last), jnp.zeros_like(last)
@@ -254,7 +254,7 @@ def _next_meeting(scene: Scene, start: Held, end: Particles, t: ArrayLike, dt: A
     return _Meeting(last <= 1, first, last, above, below, tuple(dip.last <= 1 for dip in dips))
 
 
-class _Dip(NamedTuple):
+class Dip(NamedTuple):
     """Where a gap goes below zero within a leg: after the share `first`, before `last` (infinite: nowhere), and how deep."""
 
     first: Array
@@ -263,7 +263,7 @@ class _Dip(NamedTuple):
     below: Array
 
 
-def _dip(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> _Dip:
+def dip_of(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Dip:
     """The first dip of the gap, as the cubic d(s) = d₀ + r s + b s² + a s³ through the ends of the leg has it."""
     d0, d1 = face.gap(t, start.position), face.gap(t + dt, end.position)
     r0 = dt * dot(face.relative(start.velocity), face.outward(t, start.position))
@@ -282,7 +282,7 @@ def _dip(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, end: P
     bounced = (d0 <= float(jnp.finfo(d0.dtype).eps) ** 0.5 * r0) & (r0 > 0) & (highest > 0) & (highest < last)
     first = jnp.where(bounced, 0.1 * highest, 0.0)
     below = jnp.where(last == 1.0, d1, depth)
-    return _Dip(first, last, jnp.where(first > 0, cubic(first), d0), below)
+    return Dip(first, last, jnp.where(first > 0, cubic(first), d0), below)
 
 
 def _guards(walls: tuple, start: Held, meeting: _Meeting, t: ArrayLike, state: Particles) -> list[Array]:
@@ -333,7 +333,7 @@ def _remembered(contacts: tuple, since: list) -> tuple:
     )
 
 
-def _where(flag: Array, a: Any, b: Any) -> Any:
+def chosen(flag: Array, a: Any, b: Any) -> Any:
     """Lane by lane a where flagged, else b, for trees of numbers and vectors."""
-    chosen = lambda x, y: jnp.where(flag if x.ndim == flag.ndim else flag[..., None], x, y)  # noqa: E731
-    return jax.tree.map(chosen, a, b)
+    pick = lambda x, y: jnp.where(flag if x.ndim == flag.ndim else flag[..., None], x, y)  # noqa: E731
+    return jax.tree.map(pick, a, b)

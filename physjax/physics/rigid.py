@@ -6,7 +6,8 @@
     thrown = Scene(rigid.bodies(brick, velocity=(5, 3, 0), angular_velocity=(0, 1, 9)), brick, (forces.Gravity(),))
 
 Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
-inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass.
+inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
+`Hull`; `contacts=(Touch(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
 """
 
 from collections.abc import Callable
@@ -19,22 +20,30 @@ from jaxtyping import Array, Float
 
 from physjax.checks import quantity, real_quantity
 from physjax.particles import Particles
+from physjax.physics.balls import Balls
 from physjax.physics.bodies import Load, OnBodies, RigidBodies, Wrench, angular_acceleration, angular_velocity, in_world
+from physjax.physics.hulls import Hull, Touch
 from physjax.physics.inertia import Inertia, real_turn
+from physjax.physics.joints import Joints, hinge
 from physjax.scene import Force, Scene, as_module
 from physjax.vectors import cross, over, scale, turn, turn_back
 
 __all__ = [
     "AtPoint",
+    "Balls",
+    "Hull",
+    "Joints",
     "Load",
     "RigidBodies",
     "RotationalDrag",
     "Thrust",
     "Torque",
+    "Touch",
     "Wrench",
     "angular_acceleration",
     "angular_velocity",
     "bodies",
+    "hinge",
     "on_bodies",
     "point",
     "point_acceleration",

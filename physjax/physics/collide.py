@@ -1,0 +1,233 @@
+"""Contact of rigid bodies: impacts in their moment, and what stays on a surface held there through the step.
+
+A step of independent bodies is cut at the impacts of each, as for particles. In between, points that touch and do not
+leave get half of the reaction's impulse at the start and half at the end of each leg (as RATTLE does, H. C. Andersen
+1983): second order in dt whatever the method, and neither a rolling ball nor a face on a slope creeps.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from physjax.lanes import any_lane, apart
+from physjax.particles import Particles
+from physjax.physics.bodies import RigidBodies, angular_acceleration, angular_velocity
+from physjax.physics.impact import IMPACTS, SHORTEST_FLIGHT, Dip, chosen, dip_of, hair
+from physjax.physics.impulses import Points, impulses
+from physjax.roots import first_root
+from physjax.scene import Scene
+from physjax.vectors import cross, dot, norm, scale
+
+SLOW = 0.1
+"""Share of the speed that a step's load gives below which a point that touches stays, neither bouncing nor leaving."""
+NEAR = 1e-3
+"""Share of the way that a step's load gives below which a point touches."""
+AT_REST = 1e-6
+"""Share of that speed below which a whole body is at rest, if its reactions balance the load: then it keeps its place."""
+
+
+class Felt(NamedTuple):
+    """The points of hulls as their surfaces feel them, the points first: `center` is where the gap is measured from."""
+
+    points: Points
+    center: Particles
+    gap: Array
+    restitution: Array
+
+
+class _Leg(NamedTuple):
+    """How far each body has come in a step: time so far [s], its state, whether it is through."""
+
+    elapsed: Array
+    state: RigidBodies
+    arrived: Array
+
+
+def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+    """The response of rigid bodies: from impact to impact, at most 8 a body and step, and held in between.
+
+    A body that would have more impacts in a step waits where it is, with its velocity, for the next. An impact after
+    which a point would fly for less than a quarter of a step is the last, where K_r < 1. Coupled bodies share their
+    step, which cannot be cut for one of them: they are held alike, but impacts are answered at its end.
+    """
+    dt = jnp.broadcast_to(dt, scene.state.lanes)
+    if scene.couples:
+        return scene.having(state=_answered_at_the_end(motion, scene, t, dt))
+    arrived = jnp.zeros(dt.shape, bool) if scene.held is None else scene.held
+    leg = _Leg(jnp.zeros_like(dt), scene.state, arrived)
+
+    def go_on(leg, _):
+        more = any_lane(~leg.arrived)
+        return lax.cond(more, lambda: chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt)), lambda: leg), None
+
+    leg, _ = lax.scan(go_on, leg, length=IMPACTS + 1)
+    return scene.having(state=leg.state)
+
+
+def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> _Leg:
+    """From where the bodies are to the first impact of each, or to the end of the step."""
+    begun, rest = t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
+    here, going = scene.having(state=leg.state), ~leg.arrived
+    kick = _kick(here, begun, dt)
+    felt = lax.stop_gradient(felt_by(here, begun, leg.state))
+    on = _on(felt, leg.state, kick, dt) & going[None]
+    thrust = _thrust(here, on, begun, rest)
+    end = apart(going, lambda: _carried(motion, here, thrust, begun, rest), leg.state)
+    held = apart(on, lambda: _landed(here, end, on, kick, begun + rest), end)
+    through = _Leg(leg.elapsed + rest, held, jnp.ones_like(leg.arrived))
+    dip = lax.stop_gradient(_dips(scene, on, felt, felt_by(here, begun + rest, held), begun, rest))
+    hit = going & jnp.any(dip.last <= 1, axis=0)
+
+    def touch():
+        duration = jnp.maximum(_moment(motion, here, (dip, hit), thrust, begun, rest), hair(dt))
+        at = apart(hit, lambda: _carried(motion, here, thrust, begun, duration), leg.state)
+        struck = _struck(scene, at, hit, kick, begun + duration, dt)
+        return chosen(hit, _Leg(leg.elapsed + duration, struck, leg.arrived), through)
+
+    return lax.cond(any_lane(hit), touch, lambda: through)
+
+
+def _answered_at_the_end(motion: Callable, scene: Scene, t: ArrayLike, dt: Array) -> RigidBodies:
+    """The whole step held by what touches from its start; impacts answered at its end, and what went in moved out."""
+    kick = _kick(scene, t, dt)
+    on = _on(lax.stop_gradient(felt_by(scene, t, scene.state)), scene.state, kick, dt)
+    end = _carried(motion, scene, _thrust(scene, on, t, dt), t, dt)
+    end = apart(on, lambda: _landed(scene, end, on, kick, t + dt), end)
+    struck = _struck(scene, end, jnp.ones(dt.shape, bool), kick, t + dt, dt)
+    for contact in _touches(scene):
+        struck = contact.respond(t + dt, struck)
+    return struck
+
+
+def _touches(scene: Scene) -> list:
+    return [contact for contact in scene.contacts if contact.response is collide]
+
+
+def _kick(scene: Scene, t: ArrayLike, dt: Array) -> Array:
+    """The velocity that the loads give in a step [m/s]: what the smallness of speeds and gaps is measured by."""
+    force, _ = scene.state.driven(scene, t)
+    return lax.stop_gradient(dt * norm(force) / scene.mass.mass)
+
+
+def felt_by(scene: Scene, t: ArrayLike, state: RigidBodies) -> Felt:
+    """Every point of every hull, as its surface feels it."""
+    parts = [contact.felt(t, state, scene.mass) for contact in _touches(scene)]
+    if len(parts) > 1 and any(part.points.friction is not None for part in parts):
+        zero = lambda part: (jnp.zeros_like(part.gap), jnp.zeros_like(part.gap))  # noqa: E731
+        rough = [part.points._replace(friction=part.points.friction or zero(part)) for part in parts]
+        parts = [part._replace(points=points) for part, points in zip(parts, rough, strict=True)]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def _near(felt: Felt, state: RigidBodies, kick: Array, dt: Array) -> Array:
+    """Which points touch: closer than a small share of a step's fall, or than rounding."""
+    eps = float(jnp.finfo(state.dtype).eps)
+    rounding = 64 * eps * (norm(felt.center.position) + dt[None] * norm(felt.center.velocity))
+    return felt.gap <= (NEAR * kick * dt)[None] + rounding
+
+
+def _on(felt: Felt, state: RigidBodies, kick: Array, dt: Array) -> Array:
+    """Which points touch and stay: the others fly, or are about to strike."""
+    speed = jnp.abs(dot(felt.points.velocity, felt.points.normal))
+    rounding = 16 * float(jnp.finfo(state.dtype).eps) * norm(felt.center.velocity)
+    return _near(felt, state, kick, dt) & (speed <= SLOW * kick[None] + rounding)
+
+
+def _thrust(scene: Scene, on: Array, t: ArrayLike, h: Array) -> tuple[Array, Array]:
+    """Force and torque of the reactions over a coming time h, of which the start gives h/2."""
+
+    def pressed():
+        start, state = _pressed(scene, scene.state, on, t, h / 2)[0], scene.state
+        given = start.momentum - state.momentum, start.angular_momentum - state.angular_momentum
+        return tuple(scale(2 / h, part) for part in given)
+
+    return apart(on, pressed)
+
+
+def _carried(motion: Callable, scene: Scene, thrust: tuple[Array, Array], t: ArrayLike, h: Array) -> RigidBodies:
+    """The motion for a time h that begins with half of the reactions' impulse."""
+    x, q, p, spin = scene.state
+    state = RigidBodies(x, q, p + scale(h / 2, thrust[0]), spin + scale(h / 2, thrust[1]))
+    return motion(scene.having(state=state), t, h).state
+
+
+def _landed(scene: Scene, end: RigidBodies, on: Array, kick: Array, t: ArrayLike) -> RigidBodies:
+    """The bodies after the other half, on what carries them; those at rest keep the place they had."""
+    held, push = _pressed(scene, end, on, t, jnp.zeros_like(kick))
+    held = _put_back(held, felt_by(scene, t, held), on & (push > 0))
+    slow = scene.mass.mass * (AT_REST * kick) ** 2
+    rests = jnp.all(jnp.stack([2 * s.kinetic_energy(scene.mass) <= slow for s in (scene.state, held)]), axis=0)
+    still, some = scene.state.held(jnp.zeros_like(kick)), jnp.any(on, axis=0)
+    return chosen(some & rests, still, chosen(some, held, end))
+
+
+def _pressed(scene: Scene, state: RigidBodies, on: Array, t: ArrayLike, ahead: Array) -> tuple[RigidBodies, Array]:
+    """The impulses that keep the points from going in, as their velocities will be a time `ahead` if nothing does."""
+    felt, mass = felt_by(scene, t, state), scene.mass
+    points = felt.points
+    force, torque = state.driven(scene, t)
+    omega, change = angular_velocity(state, mass), angular_acceleration(state, mass, torque)
+    spread = lambda vector: jnp.broadcast_to(vector, points.arm.shape)  # noqa: E731
+    # a ball touches ever other points of itself: what moves on a circle is the point in its middle
+    bent = cross(spread(omega), cross(spread(omega), felt.center.position - spread(state.position)))
+    faster = spread(scale(1 / mass.mass, force)) + cross(spread(change), points.arm) + bent
+    velocity = points.velocity + scale(jnp.broadcast_to(ahead, on.shape), faster)
+    return impulses(points._replace(velocity=velocity), on, state, mass)
+
+
+def _put_back(state: RigidBodies, felt: Felt, pressed: Array) -> RigidBodies:
+    """What the truncation of a step left between a body and what it presses on, taken away at its lowest point."""
+    lowest = jnp.min(jnp.where(pressed, felt.gap, jnp.inf), axis=0)
+    here = pressed & (felt.gap == lowest[None])
+    share = jnp.where(here, felt.gap, 0.0) / jnp.maximum(jnp.sum(here, axis=0), 1).astype(felt.gap.dtype)[None]
+    return state._replace(position=state.position - jnp.sum(scale(share, felt.points.normal), axis=0))
+
+
+def _dips(scene: Scene, on: Array, start: Felt, end: Felt, t: ArrayLike, dt: Array) -> Dip:
+    """Which points meet their surface within a leg, and between which shares of it, as the cubics of their gaps have it."""
+    parts, first = [], 0
+    for contact in _touches(scene):
+        some = slice(first, first := first + contact.hull.points.shape[-2])
+        lanes = start.gap[some].shape
+        wide = [jnp.broadcast_to(number, lanes) for number in (t, dt)]
+        ends = [jax.tree.map(lambda leaf, some=some: leaf[some], felt.center) for felt in (start, end)]
+        parts.append(dip_of(contact, *wide, *ends))
+    dip = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return dip._replace(last=jnp.where(on, jnp.inf, dip.last))
+
+
+def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun: Array, rest: Array) -> Array:
+    """When the first point reaches its surface on the method's own path [s after `begun`]; differentiable."""
+    (dip, hit), rest = lax.stop_gradient((watched, rest))
+    falls = dip.last <= 1
+
+    def lowest(duration, scene, thrust, falls, begun):
+        state = _carried(motion, scene, thrust, begun, duration)
+        return jnp.min(jnp.where(falls, felt_by(scene, begun + duration, state).gap, jnp.inf), axis=0)
+
+    last = jnp.min(dip.last, axis=0)
+    first = jnp.min(jnp.where(falls, dip.first, jnp.inf), axis=0)
+    soonest = falls & (dip.last == last[None])
+    above, below = (jnp.min(jnp.where(soonest, part, jnp.inf), axis=0) for part in (dip.above, dip.below))
+    bracket = (jnp.where(hit, first, 0.0) * rest, jnp.minimum(last, 1.0) * rest)
+    tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest
+    above, below = jnp.where(hit, above, 1.0), jnp.where(hit, below, -1.0)
+    return first_root(lowest, (scene, thrust, falls, begun), (bracket, (above, below), hit, tolerance))
+
+
+def _struck(scene: Scene, state: RigidBodies, hit: Array, kick: Array, t: ArrayLike, dt: Array) -> RigidBodies:
+    """The bodies that are hit after the impact of all their points that touch."""
+    felt = felt_by(scene, t, state)
+    active = lax.stop_gradient(_near(felt, state, kick, dt)) & hit[None]
+    lift = -felt.restitution * dot(felt.points.velocity, felt.points.normal)
+    last = (2 * lift <= SHORTEST_FLIGHT * kick[None]) & (felt.restitution < 1)
+    return apart(
+        active,
+        lambda: impulses(felt.points, active, state, scene.mass, jnp.where(last, 0.0, felt.restitution))[0],
+        state,
+    )

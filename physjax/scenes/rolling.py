@@ -1,0 +1,122 @@
+"""Bodies on the ground: what rolls, what slides and then rolls, what tumbles and lies still."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from physjax.physics import contacts, forces, inertia, rigid
+from physjax.scene import Scene
+from physjax.scenes.gallery import scene
+from physjax.study import energy
+from physjax.study.problem import Problem, Truth
+from physjax.trajectory import Trajectory
+
+
+@scene
+def rolling(slope: float = 0.3, radius: float = 0.3, length: float = 0.8, g: float = 9.8) -> Problem:
+    """A ball and a cylinder roll down a slope: the ball wins, a = (5/7) g sinθ against (2/3) g sinθ.
+
+    A cylinder touches with the ends of its axis, each with the radius around it; the ball has both in its middle.
+    """
+    down, up = _along(slope), np.array([np.sin(slope), np.cos(slope), 0.0])
+    ball, roller = inertia.sphere(2.0, radius), inertia.cylinder(2.0, radius, length)
+    both = inertia.Inertia(2.0, jnp.stack([ball.principal, roller.principal]))
+    axis = np.zeros((2, 2, 3))
+    axis[1, :, 2] = -length / 2, length / 2
+    ground = contacts.Plane((0.0, 0.0, 0.0), up, coulomb=contacts.Coulomb(0.4, 0.4))
+    start = rigid.bodies(both, radius * up + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
+    race = Scene(start, both, (forces.Gravity(g),), (rigid.Touch(rigid.Hull(axis, radius), ground),))
+    share = np.array([5 / 7, 2 / 3])
+    duration = 1.5
+
+    def way(flight):
+        return (flight.position[-1] - flight.position[0]) @ down * 2 / (duration**2 * g * np.sin(slope))
+
+    return Problem(
+        race,
+        duration=duration,
+        conserved=(energy.ENERGY,),
+        truths=(
+            Truth("rolls down with a/(g sinθ) of 5/7 and 2/3 [1]", way, share, 1e-6),
+            Truth(
+                "rolls without slipping, ωr = v [relative]",
+                lambda f: -_omega(f)[-1, :, 2] * radius / (_velocity(f)[-1] @ down),
+                1.0,
+                1e-9,
+            ),
+        ),
+        frames=16,
+    )
+
+
+@scene
+def bowling(speed: float = 6.0, friction: float = 0.12, radius: float = 0.108, g: float = 9.8) -> Problem:
+    """A bowling ball that is thrown without spin slides, then rolls for good at (5/7) v₀, after 2v₀/(7μg)."""
+    ball = inertia.sphere(6.0, radius)
+    alley = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(friction, friction))
+    start = rigid.bodies(ball, (0.0, radius, 0.0), velocity=(speed, 0.0, 0.0))
+    thrown = Scene(start, ball, (forces.Gravity(g),), (rigid.Touch(rigid.Hull.sphere(radius), alley),))
+    slides = 2 * speed / (7 * friction * g)
+    way = speed * slides - friction * g * slides**2 / 2 + 5 / 7 * speed * slides
+    return Problem(
+        thrown,
+        duration=2 * slides,
+        truths=(
+            Truth("rolls at (5/7) v₀ [relative]", lambda f: _velocity(f)[-1, 0] / speed, 5 / 7, 1e-6),
+            Truth("turns as it rolls, ωr/v₀ [1]", lambda f: -_omega(f)[-1, 2] * radius / speed, 5 / 7, 1e-6),
+            Truth(
+                "has come as far as v₀t - μgt²/2, then 5/7 v₀t [relative]", lambda f: f.position[-1, 0] / way, 1.0, 1e-6
+            ),
+        ),
+        frames=32,
+    )
+
+
+@scene
+def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
+    """Three boxes dropped with a spin: one that sticks, one that bounces a while, one that bounces for ever."""
+    size = np.array([0.4, 0.2, 0.3])
+    box = inertia.box(2.0, size)
+    rough = np.array([0.6, 0.4, 0.0])
+    floor = contacts.Plane(
+        (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=np.array([0.0, 0.5, 1.0]), coulomb=contacts.Coulomb(rough, rough)
+    )
+    place = np.array([[-1.0, height, 0.0], [0.0, height, 0.0], [1.0, height, 0.0]])
+    start = rigid.bodies(box, place, (0.9, 0.3, 0.2, 0.1), angular_velocity=(1.0, 2.0, 3.0))
+    dropped = Scene(start, box, (forces.Gravity(g),), (rigid.Touch(rigid.Hull.box(size), floor),))
+
+    def lying(flight):
+        """By how much the height of each is off the nearest of the halves of its edges."""
+        above = flight.position[-1, :2, 1]
+        return np.abs(above[:, None] - size / 2).min(axis=-1)
+
+    def told(flight):
+        states, scene = (jax.tree.map(jnp.asarray, part) for part in (flight.state, flight.scene))
+        return np.asarray(jax.vmap(lambda t, s: energy.total(scene, t, s))(jnp.asarray(flight.time), states))
+
+    return Problem(
+        dropped,
+        duration=4.0,
+        truths=(
+            Truth("two come to rest on a face [m]", lying, 0.0, 1e-6),
+            Truth("and do not move [m]", lambda f: f.position[-8:, :2] - f.position[-8, :2], 0.0, 1e-9),
+            Truth("the third keeps its energy [relative]", lambda f: told(f)[:, 2] / told(f)[0, 2], 1.0, 1e-6),
+            Truth("no energy is won [relative]", lambda f: np.maximum(told(f) / told(f)[0] - 1, 0.0), 0.0, 1e-6),
+        ),
+        frames=64,
+    )
+
+
+def _along(slope: float) -> np.ndarray:
+    return np.array([np.cos(slope), -np.sin(slope), 0.0])
+
+
+def _velocity(flight: Trajectory) -> np.ndarray:
+    """Velocity of the centres of mass at every frame [m/s]."""
+    return flight.state.momentum / flight.scene.mass.mass
+
+
+def _omega(flight: Trajectory) -> np.ndarray:
+    """Angular velocity at every frame [rad/s]."""
+    states, mass = (jax.tree.map(jnp.asarray, part) for part in (flight.state, flight.scene.mass))
+    return np.asarray(jax.vmap(lambda state: rigid.angular_velocity(state, mass))(states))
