@@ -114,7 +114,7 @@ _PAGE = """<!doctype html>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }}
 body {{ color: #222; background: #fff; }}
 .wide {{ overflow-x: auto; }}
-img {{ display: block; width: 100%; height: auto; }}
+img {{ display: block; max-width: 100%; height: auto; }}
 pre {{ overflow-x: auto; background: #f6f6f6; padding: 1em; font-size: 13px; line-height: 1.4; }}
 footer {{ color: #666; margin: 3em 0; }}
 </style>

@@ -100,8 +100,8 @@ def test_what_cannot_be_had_says_why_in_one_sentence(name, part, reason):
 
 def test_later_parts_follow_the_cheapest_of_our_runs_that_is_true_enough():
     coarse, good, finer = (run_of("rk4", error, s) for error, s in ((3 * WANTED, 0.1), (WANTED, 0.2), (1e-9, 0.3)))
-    rival = run_of("diffrax Tsit5", 1e-9, 0.01)
-    assert of("projectile", coarse, rival, finer, good).run is good
+    rival, unsteady = run_of("diffrax Tsit5", 1e-9, 0.01), run_of("midpoint", 1e-9, 0.01)
+    assert of("projectile", coarse, rival, unsteady, finer, good).run is good
     assert of("projectile", coarse, rival, run_of("verlet", 0.5, 0.01)).run is coarse
     told = of("projectile", good)
     assert told.stepping["dt"] * 64 == told.problem.duration
