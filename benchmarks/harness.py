@@ -225,14 +225,26 @@ def avx512() -> bool:
 
 def options(about: str) -> tuple[bool, Path]:
     """The command line: whether to be quick, and the folder of the results, tried before the work."""
+    given = parsed(parser(about))
+    return given.quick, given.out
+
+
+def parser(about: str) -> argparse.ArgumentParser:
+    """The options that every benchmark has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small sizes: shows that everything runs, proves nothing")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="where results go (%(default)s)")
+    return parser
+
+
+def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """What was given, the folder of the results tried."""
     given = parser.parse_args()
     try:
-        return given.quick, writable_folder(given.out)
+        given.out = writable_folder(given.out)
     except OSError as error:
         parser.error(str(error))
+    return given
 
 
 def result_path(folder: Path, name: str, quick: bool, ending: str) -> Path:

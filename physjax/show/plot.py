@@ -39,6 +39,10 @@ MARKERS = "osD^vPX*"
 RIVALS = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
 PROJECTED = ", projected"
 """What is added to a method's name where its touches are answered at the end of the step."""
+FLOAT32 = ", float32"
+"""What is added where it ran in float32."""
+ADAPTIVE = "adaptive "
+"""What stands before the name of a method that is subdivided."""
 MOST_LANES = 200
 """Paths drawn of a scene with more lanes than this; the eye tells no more apart."""
 
@@ -46,9 +50,11 @@ MOST_LANES = 200
 def style(method: str) -> dict[str, Any]:
     """Line style of a method: colour and marker by its place in the registry, dashed and hollow where it is projected.
 
-    Rivals are grey.
+    Subdivided methods are dash-dotted with stars, those in float32 pale, rivals grey.
     """
-    name = method.removesuffix(PROJECTED)
+    narrow = method.endswith(FLOAT32)
+    plain = method.removesuffix(FLOAT32)
+    name = plain.removesuffix(PROJECTED).removeprefix(ADAPTIVE)
     if name in METHODS:
         place = list(METHODS).index(name)
         line = {
@@ -58,7 +64,11 @@ def style(method: str) -> dict[str, Any]:
             "linewidth": 1.5,
             "markersize": 4.5,
         }
-        return line if name == method else line | {"linestyle": "--", "linewidth": 1.1, "markerfacecolor": "white"}
+        if plain.endswith(PROJECTED):
+            line |= {"linestyle": "--", "linewidth": 1.1, "markerfacecolor": "white"}
+        if plain.startswith(ADAPTIVE):
+            line |= {"linestyle": "-.", "marker": "*", "markersize": 7}
+        return line | {"alpha": 0.45, "linewidth": 1.0, "markersize": 3} if narrow else line
     color, line = RIVALS.get(method, ("0.4", ":"))
     return {"color": color, "marker": ".", "linestyle": line, "linewidth": 1.2, "markersize": 5}
 
@@ -146,26 +156,39 @@ def gradient_health(result: Any, ax: Any = None) -> Any:
 def work_precision(result: Any, figure: Any = None) -> Any:
     """Four panels of an `accuracy.WorkPrecision`: path, error against time, error against step, drift (or evaluations).
 
-    Runs that failed stand as crosses on the upper edge, where they died. Returns the figure.
+    Runs that failed stand as crosses on the upper edge, where they died; Pareto's front is a band. Where gradients or
+    other norms were studied, two more panels show them against time. Returns the figure.
     """
     from matplotlib import pyplot as plt
 
-    figure = figure or plt.figure(figsize=(11, 9))
+    more = bool(result.gradients or result.norms)
+    figure = figure or plt.figure(figsize=(11, 13 if more else 9))
     bottom = _below(figure, result)
-    panels = figure.subplots(
-        2, 2, gridspec_kw={"left": 0.08, "right": 0.98, "top": 0.92, "bottom": bottom, "wspace": 0.22, "hspace": 0.3}
-    )
-    figure.suptitle(f"{result.name.replace('_', ' ')}: {seconds_text(result.duration)}, {result.dtype}", fontsize=14)
+    grid = {
+        "left": 0.08,
+        "right": 0.98,
+        "top": 0.945 if more else 0.92,
+        "bottom": bottom,
+        "wspace": 0.22,
+        "hspace": 0.3,
+    }
+    panels = figure.subplots(2 + more, 2, gridspec_kw=grid)
+    copies = f", {result.batch:,} copies at once" if result.batch > 1 else ""
+    title = f"{result.name.replace('_', ' ')}: {seconds_text(result.duration)}, {result.dtype}{copies}"
+    figure.suptitle(title, fontsize=14)
     time, position = result.path
     seen = position.reshape(position.shape[0], -1, position.shape[-1])[..., :2]  # space is seen from above
     _paths(time, seen, math.ceil(seen.shape[1] / MOST_LANES), None, panels[0, 0]).set_title(
         f"the path ({result.truth})", fontsize=11
     )
+    if math.isfinite(result.horizon):
+        _mark_horizon(panels[0, 0], time, seen, result.horizon)
 
     ax = panels[0, 1]
     _curves(ax, result, "seconds", "path_error")
     ax.set(xlabel="run time [s]", ylabel="largest error on the path [path extent]")
     ax.set_title("speed against accuracy: lower left is better", fontsize=11)
+    _band(ax, result.front)
 
     ax = panels[1, 0]
     _curves(ax, result, "dt", "path_error")
@@ -181,7 +204,43 @@ def work_precision(result: Any, figure: Any = None) -> Any:
         _curves(ax, result, "evaluations", "path_error")
         ax.set(xlabel="force evaluations", ylabel="largest error on the path [path extent]")
         ax.set_title("the same on any machine: error against evaluations", fontsize=11)
+    if more:
+        _more(panels[2], result)
     return figure
+
+
+def _band(ax: Any, front: Any) -> None:
+    """Pareto's front, behind the lines."""
+    across, up = [run.seconds for run in front], [max(run.path_error, 1e-17) for run in front]
+    ax.plot(across, up, color="#F0E442", linewidth=9, alpha=0.5, zorder=0, solid_capstyle="round")
+    if front:
+        ax.annotate("Pareto's front", (across[0], up[0]), xytext=(8, 4), textcoords="offset points", fontsize=8)
+
+
+def _mark_horizon(ax: Any, time: np.ndarray, position: np.ndarray, horizon: float) -> None:
+    """Where rounding has grown to a hundredth of the path: what follows is one of many paths."""
+    if position.shape[-1] == 1:
+        ax.axvline(horizon, color="0.2", linestyle="--")
+    else:
+        ax.plot(*position[np.searchsorted(time, horizon)].T, "o", color="0.2", markerfacecolor="white")
+    ax.set_title(f"{ax.get_title()}\nchaos: beyond {seconds_text(horizon)} (marked) errors mean nothing", fontsize=10)
+
+
+def _more(panels: Any, result: Any) -> None:
+    """Gradient error against gradient cost, and the first of the other norms against time."""
+    left, right = panels
+    if result.gradients:
+        _curves(left, result._replace(runs=result.gradients, floor=0.0), "seconds", "path_error")
+        left.set(xlabel="time of path and derivative [s]", ylabel="largest error of the derivative [its largest]")
+        left.set_title("gradient error against gradient cost", fontsize=11)
+    if result.norms:
+        # as drifts are drawn: the number stands in a place of its own
+        swapped = [run._replace(path_error=run.errors[0]) for run in result.runs]
+        _curves(right, result._replace(runs=tuple(swapped), floor=0.0), "seconds", "path_error")
+        right.set(xlabel="run time [s]", ylabel=f"error of {result.norms[0]} [relative]")
+        right.set_title(f"another norm: {result.norms[0]}", fontsize=11)
+    for ax, there in ((left, result.gradients), (right, result.norms)):
+        ax.set_visible(bool(there))
 
 
 def _below(figure: Any, result: Any) -> float:
@@ -207,7 +266,8 @@ def _below(figure: Any, result: Any) -> float:
         title=what,
         title_fontsize=9.5,
     )
-    return max(0.17, 0.07 + 0.023 * (projected + math.ceil(len(handles) / columns)))
+    high = 9 / figure.get_size_inches()[1]
+    return high * max(0.17, 0.07 + 0.023 * (projected + math.ceil(len(handles) / columns)))
 
 
 def _curves(ax: Any, result: Any, x: str, y: str) -> None:

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import real_quantity
-from physjax.scene import Scene, project
+from physjax.scene import Scene
 from physjax.show.report import seconds_text, table
 from physjax.stepping.simulate import simulate
 from physjax.study.limits import checked_method, name_of
 from physjax.study.removals import Removal, removals, two_at_once
+from physjax.study.running import answers_late
 
 NEEDED, NEGLIGIBLE, COSTLY, NONE = "needed", "negligible", "costs more than it gives", "none"
 SAMPLE, FEWEST, ROUNDS = 0.01, 3, 15
@@ -206,9 +207,7 @@ def _outcomes(
     also compared with one whose steps end elsewhere.
     """
     scene = removal.scene
-    late = any(contact.response is project for contact in scene.contacts) or any(
-        hasattr(force, "advance") for force in scene.forces
-    )
+    late = answers_late(scene)
     flight = simulate(scene, method, dt=dt, duration=duration, save_every=save_every)
     frames, runs = flight.steps // save_every, [flight]
     for every in (2 * save_every, *([2 * save_every + 1] if late else [])):

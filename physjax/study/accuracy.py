@@ -4,51 +4,38 @@ Everything is computed in float64 unless another dtype is asked for, errors are 
 far the reference moves, and a run that fails is kept and marked, never dropped.
 """
 
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.checks import real_quantity
-from physjax.physics import contacts
-from physjax.scene import Scene, as_module
-from physjax.show.plot import PROJECTED
-from physjax.show.report import seconds_text
-from physjax.stepping.methods import METHODS, rk4
-from physjax.stepping.reference import default_solver, in_dtype, reference, solve_ode
-from physjax.stepping.simulate import sample
-from physjax.study.ablate import ablate as ablate
+from physjax.checks import positive_integer, real_quantity
+from physjax.scene import Scene
+from physjax.stepping.methods import METHODS
+from physjax.stepping.reference import default_solver, in_dtype
+from physjax.study.ablate import ablate
+from physjax.study.contest import Budget, Contest, gradient_runs, method_runs, rival_runs, treatments
 from physjax.study.energy import Conserved
+from physjax.study.norms import Norm, as_norm, energy, final, momentum, outcome, path, penetration
 from physjax.study.problem import Problem
+from physjax.study.recommend import recommend
+from physjax.study.running import answers_late, depends_on_velocity, promised_order, random_push, title_of
 from physjax.study.work_precision import Run, WorkPrecision
-from physjax.vectors import scale
+from physjax.study.yardstick import Yardstick, yardstick
 
 TOLERANCES = tuple(10.0**-k for k in range(2, 13))
-"""Tolerances at which the adaptive rivals run."""
+"""Tolerances at which what chooses its own steps runs."""
 
 DETAIL = 12
 """Moments of the reference path for every one at which errors are measured."""
 
-FINE, COARSER = 16, 11
-"""Steps between two of those moments where rk4 must be the reference since diffrax cannot be, and to estimate its error."""
+EXACTLY = 2.5e-11
+"""Error for which our own rk4 is made fine enough where it must be the truth: its last refinement is then below 1e-12."""
 
-LATE = 4
-"""Times as many where rk4 is of first order, since something is answered at the end of a step."""
-
-
-class Budget(NamedTuple):
-    """How long a study may take: refine a step until one run costs `seconds`, time each run `repeats` times."""
-
-    seconds: float = 0.05
-    repeats: int = 5
-    refinement: float = 1.5
-
+LOST = 1e-2
+"""Rounding that has grown to this part of the path leaves no meaning to errors from point to point."""
 
 THOROUGH = Budget()
 """Step sizes half an order apart, each timed well."""
@@ -64,9 +51,12 @@ def work_precision(
     duration: float | None = None,
     exact: Callable | None = None,
     conserved: Sequence[Conserved] = (),
+    norms: Sequence[Norm | Callable] = (),
     rivals: Sequence[Any] | None = None,
     tolerances: Sequence[float] = TOLERANCES,
     dtype: Any = np.float64,
+    batch: int = 1,
+    gradient: bool = False,
     budget: Budget = THOROUGH,
     name: str = "scene",
     progress: Callable[[str], None] = lambda what: None,
@@ -74,217 +64,66 @@ def work_precision(
     """Run a scene under many methods and step sizes, and set error against cost.
 
     `problem` is a gallery problem, or a scene with its `duration` [s] and, if known, its closed form `exact(times)`.
-    `methods`: all of the registry by default. `dts` [s]: from coarse to fine within the budget by default; each is
-    rounded so that a whole number of steps fits between the moments compared. `rivals`: diffrax solvers, run adaptively
-    at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts or forces that remember. The
-    truth is the closed form where there is one, else diffrax's Dopri8 at 1e-13, or, where diffrax has no rivals either,
-    our own rk4 with fine steps; its own error is the floor of the result. Where impacts are timed (`contacts.impact`),
-    every method runs once more with `contacts.project`, the lecture's answer at the end of the step, as "rk4,
-    projected": what that does to the order. Compiles once per method and treatment. `progress(what)` is called before
-    each method. Raises ValueError for a missing duration or bad steps.
+    `methods`: all of the registry by default; `methods.adaptive(...)` runs at the `tolerances`. `dts` [s]: from coarse
+    to fine within the budget by default; each is rounded so that a whole number of steps fits between the moments
+    compared. `norms`: errors to be measured besides those of the path and its end. `rivals`: diffrax solvers, run
+    adaptively at the `tolerances`; Tsit5 and Dopri8 by default, none where the scene has contacts or forces that
+    remember. `dtype` may be several, side by side. Times are those of `batch` copies at once. With `gradient` the
+    derivative of the path by the start's velocity, in a random direction, is studied as well.
+
+    The truth is the closed form where there is one, else diffrax's Dopri8 at 1e-13, or, where diffrax has no rivals
+    either, our own rk4 with fine steps; its own error is the floor of the result. Where impacts are timed
+    (`contacts.impact`), every method runs once more with `contacts.project`, the lecture's answer at the end of the
+    step, as "rk4, projected": what that does to the order. Compiles once per method and treatment. `progress(what)` is
+    called before each method. Raises ValueError for a missing duration or bad steps.
     """
     problem = _as_problem(problem, duration, exact, conserved)
     methods = list(METHODS.values()) if methods is None else list(methods)
-    if rivals is None:
-        rivals = default_rivals() if problem.is_ode else ()
-    if rivals and not problem.is_ode:
-        raise ValueError(
-            "work_precision: the scene has contacts, through which diffrax would pass, or forces that remember, which it "
-            "would not let advance. Give rivals=()."
-        )
+    rivals = _checked_rivals(problem, rivals)
     if dts is not None:
         dts = np.atleast_1d(np.asarray(real_quantity("dts [s]", dts, above=0.0), float))
+    dtypes = [np.dtype(d) for d in (dtype if isinstance(dtype, list | tuple) else (dtype,))]
+    batch, norms = positive_integer("batch", batch), tuple(as_norm(norm) for norm in norms)
     with jax.enable_x64(True):
-        scene = in_dtype(problem.scene, dtype)
         progress("reference")
-        path, floor, source = _truth(problem)
-        truth = jax.tree.map(lambda leaf: leaf[::DETAIL], path)
-        measure = _Errors(problem, scene, truth)
-        runs = []
-        treatments = _treatments(scene)
+        push = random_push(problem.scene) if gradient else None
+        detailed = yardstick(problem._replace(frames=problem.frames * DETAIL), wanted=EXACTLY, push=push)
+        contest = Contest(problem, _at_frames(detailed), norms, budget, dts, tolerances, batch)
+        runs, slopes, promised = [], [], {}
+        pulled = depends_on_velocity(problem.scene)
         for method in methods:
-            progress(_name(method))
-            for treatment, treated in treatments.items():
-                runs += _method_runs(problem, treated, method, _name(method) + treatment, dts, measure, budget)
+            progress(title_of(method))
+            for suffix, treated in treatments(problem.scene).items():
+                for kind in dtypes:
+                    runs += method_runs(contest, treated, method, suffix, kind)
+                    promised[runs[-1].method] = promised_order(method, pulled, treated)
+                slopes += gradient_runs(contest, treated, method, suffix, push) if gradient else []
         for solver in rivals:
             progress(f"diffrax {type(solver).__name__}")
-            runs += _rival_runs(problem, scene, solver, tolerances, measure, budget)
-    velocity_dependent = _depends_on_velocity(problem.scene)
+            runs += rival_runs(contest, in_dtype(problem.scene, dtypes[0]), solver)
     return WorkPrecision(
         name=name,
         runs=tuple(runs),
-        promised={
-            _name(method) + treatment: _promised_order(method, velocity_dependent, treated)
-            for method in methods
-            for treatment, treated in treatments.items()
-        },
-        truth=source,
-        floor=floor,
+        promised=promised,
+        truth=detailed.source,
+        floor=float(detailed.doubt().max()),
         duration=problem.duration,
         conserved=tuple(quantity.name for quantity in problem.conserved),
-        dtype=np.dtype(dtype).name,
-        path=(_detailed(problem), path.position),
-        scattered=_answers_late(problem.scene),
+        dtype=" and ".join(kind.name for kind in dtypes),
+        path=(detailed.times, detailed.states.position),
+        scattered=answers_late(problem.scene),
+        norms=tuple(norm.name for norm in norms),
+        horizon=detailed.horizon(LOST, float(np.finfo(dtypes[0]).eps)),
+        batch=batch,
+        gradients=tuple(slopes),
     )
 
 
-def _treatments(scene: Scene) -> dict[str, Scene]:
-    """The scene, and where it times impacts also the scene that projects instead, by what is added to a method's name."""
-    if not any(contact.response is contacts.impact for contact in scene.contacts):
-        return {"": scene}
-    project = [
-        replace(contact, response=contacts.project, touching_since=None)
-        if contact.response is contacts.impact
-        else contact
-        for contact in scene.contacts
-    ]
-    return {"": scene, PROJECTED: Scene(scene.state, scene.mass, scene.forces, project, scene.pinned)}
-
-
-class _Errors:
-    """Errors of a run against the truth, relative to the extent of the path, the worst lane and moment."""
-
-    def __init__(self, problem: Problem, scene: Scene, truth: Any):
-        place = np.asarray(truth.place, float)
-        away = np.sqrt(np.sum((place - place[0]) ** 2, axis=-1))
-        nodes = (0, -1) if scene.couples else (0,)
-        extent = away.max(axis=nodes, keepdims=True)[0]
-        self.extent = np.where(extent > 0, extent, 1.0)
-        self.place = place
-        self.drift = jax.jit(partial(_drifts, quantities=problem.conserved))
-        self.scene, self.times = scene, jnp.asarray(problem.times)
-
-    def __call__(self, states: Any) -> tuple[float, float, tuple[float, ...]]:
-        """Final error, path error, and the relative drift of each conserved quantity."""
-        off = np.asarray(states.place, float) - self.place
-        with np.errstate(invalid="ignore", over="ignore"):
-            error = np.sqrt(np.sum(off**2, axis=-1)) / self.extent
-        drifts = tuple(float(d) for d in self.drift(self.scene, self.times, states))
-        return float(error[-1].max()), float(error.max()), drifts
-
-
-def _drifts(scene: Scene, times: Any, states: Any, quantities: tuple[Conserved, ...]) -> list:
-    """Largest change of each conserved quantity over the path, relative to its size."""
-    over_time = lambda f: jax.vmap(lambda t, state: f(scene, t, state))(times, states)  # noqa: E731
-    drifts = []
-    for quantity in quantities:
-        value, size = over_time(quantity.value), jnp.max(over_time(quantity.size), axis=0)
-        change = jnp.max(jnp.abs(value - value[:1]), axis=0)
-        drifts.append(jnp.max(scale(1 / size, change)))
-    return drifts
-
-
-def _truth(problem: Problem) -> tuple[Any, float, str]:
-    """The true path in detail, the error it has itself (relative; 0 for a closed form), and where it comes from."""
-    times = _detailed(problem)
-    if problem.exact is not None:
-        return problem.exact(times), 0.0, "closed form"
-    if not problem.is_ode:
-        return _fine_path(problem)
-    size = _smallest_size(problem.scene)
-    tolerance = {"rtol": 1e-13, "atol": 1e-13 * size}
-    path = reference(problem.scene, times, **tolerance)
-    # the same tolerance with longer steps, which need not land on the moments between: the difference is their error
-    other = reference(problem.scene, problem.times, **tolerance)
-    floor = _apart(path.state, jax.tree.map(lambda leaf: leaf[::DETAIL], path.state), other.state)
-    return path.state, floor, "diffrax Dopri8, tolerance 1e-13"
-
-
-def _fine_path(problem: Problem) -> tuple[Any, float, str]:
-    """The path by rk4 with fine steps; its error is estimated by longer ones, which end at other moments."""
-    scene, frames = in_dtype(problem.scene, jnp.float64), problem.frames * DETAIL
-    run = lambda count: sample(scene, as_module(rk4), problem.duration / (frames * count), count, frames=frames)  # noqa: E731
-    finer = LATE if _answers_late(scene) else 1
-    path, coarser = (jax.tree.map(np.asarray, run(jnp.asarray(finer * count))) for count in (FINE, COARSER))
-    return (
-        path,
-        _apart(path, path, coarser),
-        f"own rk4, step {seconds_text(problem.duration / (frames * finer * FINE))}",
-    )
-
-
-def _apart(path: Any, one: Any, other: Any) -> float:
-    """The largest difference of two paths, relative to the extent of one."""
-    place = np.asarray(path.place)
-    return float(np.abs(np.asarray(one.place) - other.place).max() / np.abs(place - place[0]).max())
-
-
-def _detailed(problem: Problem) -> np.ndarray:
-    """The problem's times and more between them, so that a picture of the path has no corners."""
-    return np.linspace(0.0, problem.duration, problem.frames * DETAIL + 1)
-
-
-def _method_runs(problem, scene, method, name, dts, measure, budget):
-    """One method, from coarse to fine: one compilation, then runs until the budget or rounding ends the refinement."""
-    dt = jnp.asarray(problem.duration / problem.frames, scene.state.dtype)
-    module = as_module(method)
-    started = time.perf_counter()
-    compiled = sample.lower(scene, module, dt, jnp.asarray(1), frames=problem.frames).compile()
-    compile_seconds = time.perf_counter() - started
-    evaluations = _evaluations(method, scene)
-    runs = []
-    for count in _counts(problem, dts, budget):
-        h = jnp.asarray(problem.duration / (problem.frames * count), scene.state.dtype)
-        states, seconds = _timed(partial(compiled, scene, module, h, jnp.asarray(count)), budget)
-        steps = count * problem.frames
-        final, path, drifts = measure(states)
-        runs.append(
-            Run(name, float(h), None, steps, evaluations * steps, *seconds, compile_seconds, final, path, drifts)
-        )
-        if dts is None and (seconds[0] > budget.seconds or _at_rounding(runs)):
-            break
-    return runs
-
-
-def _rival_runs(problem, scene, solver, tolerances, measure, budget):
-    """A diffrax solver with adaptive steps, from loose to tight tolerance; one compilation."""
-    size = _smallest_size(scene)
-    times = jnp.asarray(problem.times, scene.state.dtype)
-    arguments = lambda tol: (scene, times, times[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
-    started = time.perf_counter()
-    compiled = solve_ode.lower(*arguments(1e-3)).compile()
-    compile_seconds = time.perf_counter() - started
-    stages = solver.tableau.num_stages - (1 if solver.tableau.fsal else 0)
-    name = f"diffrax {type(solver).__name__}"
-    runs = []
-    for tol in tolerances:
-        (states, success, stats), seconds = _timed(partial(compiled, *arguments(tol)), budget)
-        final, path, drifts = measure(states)
-        steps = int(stats["num_steps"])
-        if not success:
-            final = path = float("nan")
-        runs.append(Run(name, None, tol, steps, stages * steps + 1, *seconds, compile_seconds, final, path, drifts))
-        if success and seconds[0] > budget.seconds:
-            break
-    return runs
-
-
-def _timed(run, budget):
-    """The result of a run, and the least and the median of its times [s]; the first counts only where it is long."""
-    times = []
-    for _ in range(budget.repeats + 1):
-        started = time.perf_counter()
-        result = jax.block_until_ready(run())
-        times.append(time.perf_counter() - started)
-        if times[-1] > 2 * budget.seconds:
-            break
-    times = times[1:] or times
-    return result, (min(times), float(np.median(times)))
-
-
-def _counts(problem, dts, budget):
-    """Numbers of steps between two frames, from coarse to fine, without repeats."""
-    if dts is not None:
-        spacing = problem.duration / problem.frames
-        return sorted({max(1, round(spacing / dt)) for dt in dts})
-    counts = np.unique(np.round(budget.refinement ** np.arange(0, 60)).astype(int))
-    return [int(c) for c in counts if c < 10**8]
-
-
-def _at_rounding(runs):
-    """Whether the last two refinements no longer reduced the error: rounding has taken over."""
-    errors = [run.path_error for run in runs[-3:]]
-    return len(errors) == 3 and max(errors) < 1e-7 and errors[1] > 0.9 * errors[0] and errors[2] > 0.9 * errors[1]
+def _at_frames(detailed: Yardstick) -> Yardstick:
+    """The truth at the moments at which errors are measured."""
+    fewer = lambda tree: jax.tree.map(lambda leaf: leaf[::DETAIL], tree)  # noqa: E731
+    parts = {name: fewer(getattr(detailed, name)) for name in ("states", "second", "nudged", "slopes")}
+    return detailed._replace(times=detailed.times[::DETAIL], **parts)
 
 
 def _as_problem(problem, duration, exact, conserved):
@@ -300,6 +139,17 @@ def _as_problem(problem, duration, exact, conserved):
     return Problem(problem, float(duration), exact, tuple(conserved))
 
 
+def _checked_rivals(problem, rivals):
+    if rivals is None:
+        return default_rivals() if problem.is_ode else ()
+    if rivals and not problem.is_ode:
+        raise ValueError(
+            "work_precision: the scene has contacts, through which diffrax would pass, or forces that remember, which it "
+            "would not let advance. Give rivals=()."
+        )
+    return rivals
+
+
 def default_rivals() -> tuple:
     """The adaptive solvers that a user of diffrax would reach for first: Tsit5, and Dopri8 for many digits."""
     import diffrax
@@ -307,71 +157,21 @@ def default_rivals() -> tuple:
     return diffrax.Tsit5(), default_solver()
 
 
-def _smallest_size(scene: Scene) -> float:
-    """Typical size of the smaller of position and velocity: what an absolute tolerance is measured by."""
-    leaves = jax.tree.leaves((scene.state, _driven(scene, scene.state)))
-    sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in leaves]
-    return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
-
-
-def _depends_on_velocity(scene: Scene) -> bool:
-    """Whether the forces look at the velocity: the promise of some methods depends on it."""
-    with jax.enable_x64(True):
-        scene = in_dtype(scene, jnp.float64)
-        rng = np.random.default_rng(0)
-        push = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * (1 + jnp.abs(leaf)), scene.state)
-        ends = (_driven(scene, scene.kick(scene.state, push, sign)) for sign in (1.0, -1.0))
-        return any(bool(jnp.any(a != b)) for a, b in zip(*map(jax.tree.leaves, ends), strict=True))
-
-
-@jax.jit  # one compilation instead of one for each operation
-def _driven(scene: Scene, state: Any) -> Any:
-    return state.driven(scene, jnp.zeros((), state.dtype))
-
-
-def _promised_order(method, velocity_dependent, scene):
-    """The order that a method promises for a scene; at most 1 where something is answered at the end of a step."""
-    promises = getattr(method, "promises", None)
-    if promises is None:
-        return float("nan")
-    order = float(promises.order_with_drag if velocity_dependent else promises.order)
-    return min(order, 1.0) if _answers_late(scene) else order
-
-
-def _answers_late(scene):
-    """Whether something that happens within a step is answered at its end: a touch that is projected, a spring that parts."""
-    late = any(contact.response is contacts.project for contact in scene.contacts)
-    return late or any(hasattr(force, "advance") for force in scene.forces)
-
-
-class _Counter(NamedTuple):
-    """A system that counts how often a method asks for the right-hand side."""
-
-    scene: Scene
-    calls: list
-
-    def rate(self, t, state):
-        self.calls.append(t)
-        return self.scene.rate(t, state)
-
-    def kick(self, state, rate, dt):
-        return self.scene.kick(state, rate, dt)
-
-    def drift(self, state, dt):
-        return self.scene.drift(state, dt)
-
-
-def _evaluations(method, scene):
-    """Force evaluations a step: promised, or counted for a method that promises nothing."""
-    if hasattr(method, "promises"):
-        return method.promises.evaluations
-    counter = _Counter(scene, [])
-    jax.eval_shape(lambda state: method(counter, jnp.zeros((), scene.state.dtype), state, 1.0), scene.state)
-    return len(counter.calls)
-
-
-def _name(method):
-    return getattr(method, "__name__", type(method).__name__)
-
-
-__all__ = ["QUICK", "THOROUGH", "TOLERANCES", "Budget", "Run", "WorkPrecision", "default_rivals", "work_precision"]
+__all__ = [
+    "QUICK",
+    "THOROUGH",
+    "TOLERANCES",
+    "Budget",
+    "Run",
+    "WorkPrecision",
+    "ablate",
+    "default_rivals",
+    "energy",
+    "final",
+    "momentum",
+    "outcome",
+    "path",
+    "penetration",
+    "recommend",
+    "work_precision",
+]

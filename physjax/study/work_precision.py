@@ -23,7 +23,8 @@ EXACT = 1e-10
 class Run(NamedTuple):
     """One run of one method. Errors are relative to the extent of the path; `drifts` to the size of the conserved quantity.
 
-    `dt` [s] is None for adaptive rivals, `tolerance` is None for fixed steps. `seconds` is the least and
+    `dt` [s] is None for what chooses its own steps, `tolerance` is None for fixed steps. `errors` are those in the norms
+    that were asked for. `seconds` is the least and
     `seconds_median` the median of several timings, compiling apart.
     """
 
@@ -38,6 +39,8 @@ class Run(NamedTuple):
     final_error: float
     path_error: float
     drifts: tuple[float, ...]
+    errors: tuple[float, ...] = ()
+    dtype: str = "float64"
 
     @property
     def status(self) -> str:
@@ -50,7 +53,9 @@ class Run(NamedTuple):
 class WorkPrecision(NamedTuple):
     """All runs of a scene under its methods and rivals, their truth, and that truth's own error (`floor`).
 
-    `scattered`: touches are answered, or springs part, at the end of a step, under every method.
+    `scattered`: touches are answered, or springs part, at the end of a step, under every method. `horizon` [s] is when
+    rounding has grown to a hundredth of the path; infinite without chaos. Times are those of `batch` copies, errors in
+    `gradients` those of the derivative by the start.
     """
 
     name: str
@@ -63,6 +68,10 @@ class WorkPrecision(NamedTuple):
     dtype: str
     path: tuple[np.ndarray, np.ndarray]
     scattered: bool = False
+    norms: tuple[str, ...] = ()
+    horizon: float = math.inf
+    batch: int = 1
+    gradients: tuple[Run, ...] = ()
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -95,6 +104,15 @@ class WorkPrecision(NamedTuple):
         """The run with the least time whose path error stays below `error`; None if none does."""
         return _cheapest([run for run in self.runs if rivals or run.tolerance is None], error)
 
+    @property
+    def front(self) -> tuple[Run, ...]:
+        """Pareto's front: the runs that no other beats in both time and error, from fast to accurate."""
+        front: list[Run] = []
+        for run in sorted((run for run in self.runs if run.status == "ok"), key=lambda run: run.seconds):
+            if not front or run.path_error < front[-1].path_error:
+                front.append(run)
+        return tuple(front)
+
     def table(self) -> str:
         """A line for each method: order promised and observed, its cheapest run for each of `ERRORS`, and where it failed."""
         headers = [
@@ -124,15 +142,23 @@ class WorkPrecision(NamedTuple):
 
     def to_csv(self, path: str | os.PathLike) -> None:
         """Write every run as one line of a CSV file; whole or absent."""
-        fields = [name for name in Run._fields if name != "drifts"]
+        fields = [name for name in Run._fields if name not in ("drifts", "errors")]
         with replacing(path) as file:
             writer = csv.writer(file)
             writer.writerow(
-                ["scene", *fields, *(f"drift of {name}" for name in self.conserved), "status", "truth", "floor"]
+                [
+                    "scene",
+                    *fields,
+                    *(f"drift of {name}" for name in self.conserved),
+                    *(f"error of {name}" for name in self.norms),
+                    "status",
+                    "truth",
+                    "floor",
+                ]
             )
             for run in self.runs:
                 numbers = [getattr(run, name) for name in fields]
-                writer.writerow([self.name, *numbers, *run.drifts, run.status, self.truth, self.floor])
+                writer.writerow([self.name, *numbers, *run.drifts, *run.errors, run.status, self.truth, self.floor])
 
     def plot(self, figure: Any = None) -> Any:
         """Draw the study: the path, error against time, error against step, and drift or cost. Returns the matplotlib figure."""
@@ -142,7 +168,7 @@ class WorkPrecision(NamedTuple):
 
     def _rounding(self, run: Run) -> float:
         """Errors below this are rounding, or the truth's own."""
-        return max(10 * self.floor, 100 * float(np.finfo(self.dtype).eps) * math.sqrt(run.steps))
+        return max(10 * self.floor, 100 * float(np.finfo(run.dtype).eps) * math.sqrt(run.steps))
 
 
 def _cheapest(runs: Sequence[Run], error: float) -> Run | None:

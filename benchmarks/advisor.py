@@ -1,0 +1,313 @@
+"""Does the advisor keep its promises, is what it recommends the fastest, and how does that compare with diffrax?
+
+    python benchmarks/advisor.py --part promises --scenes kepler random:0 random:1
+    python benchmarks/advisor.py --part rivals
+    python benchmarks/advisor.py --part report
+
+Each scene is written as soon as it is done, and what is written is not done again, so that a run can be broken off and
+resumed; `--limit` seconds end it by themselves. `--part report` judges and draws what there is.
+
+Promises: on every scene of the gallery and 40 random ones, one search serves three errors; each recommended run is made
+by `.simulate()` and judged by another truth than the search's (a closed form; our own rk4 where the search had diffrax;
+verlet where it had our rk4), and timed in turn with the fastest run of an exhaustive search, steps √2 apart: of every
+method of the registry and adaptive rk4 on smooth scenes; of what the search would try first where there are contacts,
+which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ by a percent; diffrax's solvers
+under vmap, each at the loosest of its tolerances, a power of ten apart, that keeps the error.
+"""
+
+import json
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import harness
+import jax
+import jax.numpy as jnp
+import numpy as np
+from harness import Bar, tell
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from random_scenes import random_scene
+
+from physjax import methods
+from physjax.scenes import SCENES
+from physjax.stepping.methods import METHODS
+from physjax.stepping.reference import discontinuities, in_dtype, ode_term
+from physjax.study import norms
+from physjax.study.accuracy import recommend
+from physjax.study.problem import Problem
+from physjax.study.recommend import candidates
+from physjax.study.running import contender, copies, smallest_size
+from physjax.study.search import Question, explored, timed_in_turn
+from physjax.study.yardstick import yardstick
+
+ERRORS = (1e-2, 1e-4, 1e-6)
+RANDOM = 40
+BATCH = 1000
+SOLVERS = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno5")
+WITHIN = 1.5
+SLOW = 4.0
+"""Seconds of a rival's run that end its refinement."""
+
+
+def problem_of(name):
+    """A scene of the gallery, or `random:SEED`."""
+    with jax.enable_x64(True):
+        kind, _, seed = name.partition(":")
+        return Problem(*random_scene(int(seed))) if kind == "random" else SCENES[name]()
+
+
+def promises(name):
+    """One search for three errors, its promises checked, its runs against the fastest of an exhaustive search."""
+    problem = problem_of(name)
+    started, busy = time.perf_counter(), time.process_time()
+    answers = recommend(problem.scene, error=ERRORS, horizon=problem.duration, frames=problem.frames, progress=False)
+    seconds, busy = time.perf_counter() - started, time.process_time() - busy
+    with jax.enable_x64(True):
+        second = methods.rk4 if problem.is_ode else methods.verlet
+        other = yardstick(problem, wanted=1e-7, seconds=6.0, own=None if problem.exact is not None else second)
+        doubt = float(other.doubt().max())
+        runs = exhaustive(problem, answers)
+        rows = [judged(problem, other, doubt, advice, runs) for advice in answers]
+    return {
+        "seconds": seconds,
+        "busy": busy,
+        "truth": answers[0].truth,
+        "other": other.source,
+        "doubt": doubt,
+        "answers": rows,
+    }
+
+
+def exhaustive(problem, answers):
+    """(contender, run) of every method in float64, √2 apart."""
+    entries = [*METHODS.values(), methods.adaptive(methods.rk4)]
+    if not problem.is_ode:
+        entries = candidates(problem.scene)[:3]
+    slowest = max((a.best.seconds * problem.duration for a in answers if a.ok), default=0.1)
+    truth = yardstick(problem._replace(exact=None), wanted=min(ERRORS))
+    question = Question(problem, truth, norms.path, None, None, time.process_time() + 30)
+    runs = []
+    for method in entries:
+        entry = contender(problem, method)
+        for start in (1.0,) if entry.adaptive else (1.0, np.sqrt(2.0)):
+            trials = explored(question, entry, min(ERRORS), (), start, longest=4 * slowest).trials
+            runs += [(entry, trial) for trial in trials]
+    return runs
+
+
+def judged(problem, other, doubt, advice, runs):
+    """A promise, kept or not, and its time beside that of the fastest run that keeps the same error."""
+    row = {"error": advice.error, "ok": advice.ok, "reason": advice.reason, "evidence": advice.evidence}
+    if not advice.ok:
+        return row
+    best = advice.best
+    found = norms.path.error(other.scene, other.times, advice.simulate().state, other.states)
+    row |= {"method": best.name, "dtype": best.dtype, "step": best.step, "promised": best.error, "found": found}
+    row |= {"checked": doubt < 0.2 * advice.error, "kept": bool(found <= advice.error + doubt)}
+    good = [(entry, trial) for entry, trial in runs if trial.error <= advice.error]
+    if good:
+        mine = contender(problem, best.method, best.dtype)
+        fineness = 1 / best.tolerance if best.tolerance else float(best.steps_per_frame)
+        # the few that look fastest take turns: a single look may have met a quiet moment
+        few = sorted(good, key=lambda pair: pair[1].seconds)[:3]
+        turns = [(mine, good[0][1]._replace(fineness=fineness)), *few]
+        own, *others = timed_in_turn([(entry, trial._replace(seconds=np.inf)) for entry, trial in turns])
+        fastest = int(np.argmin(others))
+        row |= {"ratio": own / others[fastest], "fastest": few[fastest][0].name}
+        row["its_step"] = few[fastest][0].dt(few[fastest][1].fineness)
+    return row
+
+
+def crowd(scene, count):
+    """So many of a scene, their velocities (of bodies, momenta) changed by a percent at random."""
+    rng = np.random.default_rng(0)
+    many = copies(scene, count)
+    noise = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * jnp.abs(leaf), many.state)
+    return many.having(state=scene.kick(many.state, noise, 0.01))
+
+
+def rivals(name):
+    """A thousand copies: the recommended run beside diffrax's solvers at equal errors."""
+    problem = problem_of(name)
+    with jax.enable_x64(True):
+        single = in_dtype(problem.scene, jnp.float64)
+        many = problem._replace(scene=crowd(single, BATCH), exact=None)
+        asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
+        answers = recommend(many.scene, seconds=30, progress=False, **asked)
+        truth = yardstick(many)
+        found = [run for solver in SOLVERS for run in rival_runs(single, many, truth, solver)]
+    rows = []
+    for advice in answers:
+        good = [run for run in found if run["error"] <= advice.error]
+        best = min(good, key=lambda run: run["seconds"], default=None)
+        row = {"error": advice.error, "reason": advice.reason}
+        if advice.ok:
+            row |= {
+                "ours": advice.best.name,
+                "dtype": advice.best.dtype,
+                "seconds": advice.best.seconds * many.duration,
+            }
+        if best:
+            row |= {"diffrax": best["solver"], "its_seconds": best["seconds"]}
+        rows.append(row | ({"times": row["its_seconds"] / row["seconds"]} if advice.ok and best else {}))
+    return {"lanes": list(many.scene.state.lanes), "rows": rows, "runs": found}
+
+
+@partial(jax.jit, static_argnames=("solver", "frames"))
+def solved(scene, states, end, tol, size, solver, frames):
+    """Every copy by itself, with steps of its own."""
+    import diffrax
+
+    controller = diffrax.PIDController(rtol=tol, atol=tol * size)
+    jumps = discontinuities(scene)
+    if jumps.size:
+        controller = diffrax.ClipStepSizeController(controller, jump_ts=jumps)
+
+    def one(state):
+        return diffrax.diffeqsolve(
+            ode_term(scene),
+            getattr(diffrax, solver)(),
+            t0=0.0,
+            t1=end,
+            dt0=None,
+            y0=state,
+            saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, end, frames + 1)),
+            stepsize_controller=controller,
+            adjoint=diffrax.ForwardMode(),
+            max_steps=20_000,
+            throw=False,
+        ).ys
+
+    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), jax.vmap(one)(states))
+
+
+def rival_runs(single, many, truth, solver):
+    """Error and least time of a solver at tolerances a power of ten apart."""
+    runs = []
+    for tol in 10.0 ** -np.arange(2, 12):
+        size = smallest_size(single)
+        run = partial(solved, single, many.scene.state, many.duration, tol, size, solver, many.frames)
+        states = jax.tree.map(np.asarray, run())
+        error = norms.path.error(truth.scene, truth.times, states, truth.states)
+        seconds = min(harness.stopwatch(run) for _ in range(3))
+        if np.isfinite(error):
+            runs.append({"solver": solver, "tolerance": tol, "error": error, "seconds": seconds})
+        if seconds > SLOW or error < min(ERRORS):
+            break
+    return runs
+
+
+def report(record, folder, quick):
+    """Judge what there is, print it and draw it."""
+    answers = [(name, row) for name, r in record["promises"].items() for row in r["answers"]]
+    kept = [(name, row) for name, row in answers if row["ok"]]
+    checked = [row["kept"] for _, row in kept if row["checked"]]
+    ratios = [row["ratio"] for _, row in kept if "ratio" in row]
+    against = [(name, row) for name, r in record["rivals"].items() for row in r["rows"] if "times" in row]
+    searches = [r["busy"] for r in record["promises"].values()]
+    bars = [
+        Bar("promises kept, of those checked", float(np.mean(checked or [np.nan])), ">=", 0.98),
+        Bar(
+            "recommended within 1.5x of the fastest", float(np.mean(np.array(ratios or [np.nan]) <= WITHIN)), ">=", 0.9
+        ),
+        Bar("longest search [s of processor time]", max(searches, default=np.nan), "<=", 20.0),
+        Bar(
+            "at least as fast as diffrax", float(np.mean([r["times"] >= 1 for _, r in against] or [np.nan])), ">=", 1.0
+        ),
+    ]
+    label = lambda name, row: f"{name}, {row['error']:g}"  # noqa: E731
+    rows = [
+        [label(n, r), f"{r['method']} {r['dtype']}", r["step"], r["promised"], r["found"], r.get("ratio", np.nan)]
+        for n, r in kept
+    ]
+    harness.print_table("promises", ["", "run", "step", "promised", "found", "time / fastest"], rows)
+    rows = [
+        [label(n, r), f"{r['ours']} {r['dtype']}", r["seconds"], r["diffrax"], r["its_seconds"], r["times"]]
+        for n, r in against
+    ]
+    harness.print_table(f"{BATCH} copies", ["", "ours", "[s]", "diffrax", "[s]", "times faster"], rows)
+    stopped = [f"{label(n, r)}: {r['reason']}" for n, r in answers if not r["ok"]]
+    print("\nNothing keeps the error:", *(stopped or ["-"]), sep="\n  ")
+    scenes, smooth = len(SCENES) + RANDOM, sum(problem_of(name).is_ode for name in SCENES)
+    partial = len(searches) < scenes or len(record["rivals"]) < smooth
+    done = f"{len(searches)} of {scenes} scenes, {len(record['rivals'])} of {smooth} beside diffrax"
+    print(f"\nDone so far: {done}. {'A part proves nothing of the whole.' if partial else ''}")
+    harness.print_bars(bars, quick or partial)
+    record["bars"] = [bar._asdict() | {"met": None if partial else bar.met} for bar in bars]
+    record["counted"] = {"done": done, "answers": len(answers), "stopped": len(stopped)}
+    record["counted"] |= {"checked": len(checked), "timed": len(ratios), "against_diffrax": len(against)}
+    if against:
+        foot = f"{harness.caption(record['machine'])}; {done}"
+        draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, foot)
+
+
+def draw(path, kept, against, foot):
+    """Promises against what was found; times beside the fastest; times beside diffrax."""
+    from matplotlib.figure import Figure
+
+    from physjax.files import replacing
+
+    figure = Figure(figsize=(13, 5.4), layout="constrained")
+    promise, ratio, rival = figure.subplots(1, 3)
+    colours = dict(zip(ERRORS, ("#D55E00", "#009E73", "#0072B2"), strict=True))
+    names = list(dict.fromkeys(name for name, _ in against))
+    for error, colour in colours.items():
+        mine = [row for _, row in kept if row["error"] == error]
+        seen = [(r["promised"] / error, r["found"] / error) for r in mine if r["checked"]]
+        promise.plot(*np.maximum(np.array(seen).reshape(-1, 2), 1e-9).T, "o", color=colour, label=f"error {error:g}")
+        ratios = sorted(r["ratio"] for r in mine if "ratio" in r)
+        ratio.plot(np.linspace(0, 1, len(ratios)), ratios, color=colour)
+        times = [(r["times"], names.index(name)) for name, r in against if r["error"] == error]
+        rival.plot(*np.array(times).reshape(-1, 2).T, "o", color=colour)
+    for line, ax in ((1.0, promise), (WITHIN, ratio)):
+        ax.axhline(line, color="0.3", linestyle="--", linewidth=1)
+    rival.axvline(1.0, color="0.3", linestyle="--", linewidth=1)
+    promise.set(xlabel="error promised [asked for]", ylabel="error by another truth [asked for]", xscale="log")
+    promise.set_title("promises: on or below the line is kept")
+    ratio.set(xlabel="share of answers", ylabel="time [that of the fastest]", xlim=(0, 1))
+    ratio.set_title("beside an exhaustive search")
+    rival.set(xlabel=f"time of diffrax's best [ours], {BATCH} copies", xscale="log")
+    rival.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
+    rival.set_title("right of the line ours is faster")
+    for ax in (promise, ratio):
+        ax.set_yscale("log")
+    for ax in (promise, ratio, rival):
+        ax.grid(color="0.92")
+    promise.legend(frameon=False, fontsize=9)
+    figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
+    with replacing(path, "wb") as file:
+        figure.savefig(file, format="png", dpi=110)
+
+
+def main():
+    """Do what is not done yet, scene by scene, until the limit; then report."""
+    parser = harness.parser(__doc__)
+    parser.add_argument("--part", choices=("promises", "rivals", "report"), default="report")
+    parser.add_argument("--scenes", nargs="*", help="names of the gallery, random:SEED; all by default")
+    parser.add_argument("--limit", type=float, default=480.0, help="seconds after which no scene is begun")
+    given = harness.parsed(parser)
+    path = harness.result_path(given.out, "advisor", given.quick, "json")
+    record = json.loads(path.read_text()) if path.exists() else {"benchmark": "advisor", "promises": {}, "rivals": {}}
+    record["machine"], started = harness.machine(), time.perf_counter()
+    work = {"promises": promises, "rivals": rivals}
+    chosen = given.scenes or [*SCENES, *(f"random:{seed}" for seed in range(RANDOM) if given.part == "promises")]
+    for name in chosen if given.part in work else ():
+        if name in record[given.part] or time.perf_counter() - started > given.limit:
+            continue
+        if given.part == "rivals" and not problem_of(name).is_ode:
+            continue
+        begun = time.perf_counter()
+        record[given.part][name] = work[given.part](name)
+        tell(f"{name}: {time.perf_counter() - begun:.0f} s")
+        harness.write_json(path, record)
+        jax.clear_caches()
+    if record["promises"]:
+        report(record, given.out, given.quick)
+        harness.write_json(path, record)
+        print(f"\nwritten: {path}")
+
+
+if __name__ == "__main__":
+    main()
