@@ -16,7 +16,7 @@ from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
 from physjax.study.problem import Problem
 from physjax.study.survey import fastest_moment, map_around
-from physjax.study.work_precision import Run, WorkPrecision
+from physjax.study.work_precision import ERRORS, Run, WorkPrecision
 
 WANTED = 1e-4
 """Error, relative to the extent of the path, of the run whose books are closed and whose parts are left out."""
@@ -74,8 +74,7 @@ def sections(
     `sentence` says what the scene is. `progress(what)` is called before each part.
     """
     progress("reference and runs")
-    rivals = accuracy.default_rivals() if problem.is_ode else ()
-    precision = accuracy.work_precision(problem, rivals=rivals, budget=budget, name=name)
+    precision = accuracy.work_precision(problem, budget=budget, name=name)
     studied = Studied(name, sentence, problem, precision)
     for heading, part in PARTS.items():
         progress(heading)
@@ -170,6 +169,14 @@ def _ablated(studied: Studied) -> Iterator[Block]:
     yield Table(str(found))
 
 
+def _recommended(studied: Studied) -> Iterator[Block]:
+    problem = studied.problem
+    answers = accuracy.recommend(problem.scene, error=ERRORS, horizon=problem.duration, progress=False)
+    for answer in answers:
+        yield f"For an error of {answer.error:g}: {answer.reason}"
+    yield Table("\n\n".join(map(str, answers)))
+
+
 NO_RUN = "Not to be had: no run with a fixed step stayed on the path."
 PARTS = {
     "scene": _seen,
@@ -177,5 +184,6 @@ PARTS = {
     "stability": _stable,
     "energy ledger": _ledger,
     "ablation": _ablated,
+    "recommendation": _recommended,
 }
 """The parts of a page by their headings, in the order of reading."""

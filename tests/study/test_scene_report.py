@@ -50,6 +50,7 @@ def test_a_report_is_one_page_with_every_part_and_its_pictures_inside(tmp_path, 
     assert "rk4: " in page
     assert re.search(r"Springs|Anchor", page)
     assert "needed" in page
+    assert page.count("Evidence: ") == 3
     captured = capsys.readouterr()
     assert "oscillator.html" in captured.out
     assert f"{len(PARTS)}/{len(PARTS)}" in captured.err
