@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from physjax.particles import Particles
-from physjax.physics.contacts import impact
+from physjax.physics.contacts import impact, project
 from physjax.scene import Scene
 from physjax.show import portrait
 from physjax.show.report import Picture, Section, Table, drawn, seconds_text
@@ -121,7 +121,7 @@ def _stable(studied: Studied) -> Iterator[Block]:
         return
     yield (
         f"Runs from the start{', without their touches' if timed else ''}, judged by their error; the black line is the "
-        "limit predicted there."
+        "limit predicted at their start."
     )
     yield drawn(
         chart.plot(), f"Map of the steps at which each method is stable, inaccurate or diverged in {studied.name}."
@@ -132,6 +132,9 @@ def _ledger(studied: Studied) -> Iterator[Block]:
     scene = studied.problem.scene
     if scene.emitter is not None:
         yield "No ledger: particles bring energy when they are born and take it when they die."
+        return
+    if any(contact.response not in (impact, project) for contact in scene.contacts):
+        yield "No ledger: a contact has a response of its own, and what it does to a touch is not known."
         return
     if studied.run is None:
         yield NO_RUN

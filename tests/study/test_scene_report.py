@@ -1,8 +1,10 @@
 """The page on the whole of a scene."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
+import equinox as eqx
 import jax
 import pytest
 
@@ -97,6 +99,15 @@ def test_what_cannot_be_had_says_why_in_one_sentence(name, part, reason):
     (told,) = PARTS[part](of(name, run_of("rk4", float("nan"), 1.0)))
     assert reason in told
     assert told.count(". ") == 0
+
+
+def test_a_touch_answered_in_a_way_of_its_own_has_no_ledger():
+    told = of("tennis_ball", run_of("rk4", 1e-9, 1.0))
+    (plane,) = told.problem.scene.contacts
+    own = replace(plane, response=lambda *moment: None, touching_since=None)
+    scene = eqx.tree_at(lambda scene: scene.contacts, told.problem.scene, (own,))
+    (reason,) = PARTS["energy ledger"](told._replace(problem=told.problem._replace(scene=scene)))
+    assert "a response of its own" in reason
 
 
 def test_later_parts_follow_the_cheapest_of_our_runs_that_is_true_enough():
