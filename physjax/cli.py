@@ -1,16 +1,12 @@
 """`physjax` on the command line."""
 
 import argparse
-import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
-
-MOMENTS = 16
-"""Moments of a run at which its small motions are looked at."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -24,7 +20,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--out", default="chart", metavar="DIR", help="where pictures, CSV and the page go (default: chart)"
     )
     chart.add_argument("--quick", action="store_true", help="coarser and faster")
-    chart.set_defaults(run=lambda options: _chart(options.scenes, options.out, options.quick))
+    chart.add_argument(
+        "--report", action="store_true", help="a page for each scene instead: all there is to say of it, charts coarse"
+    )
+    chart.set_defaults(run=lambda options: _chart(options.scenes, options.out, options.quick, options.report))
 
     scenes = commands.add_parser("scenes", help="list the scenes of the gallery, or draw them")
     scenes.add_argument("--only", nargs="+", default=[], metavar="SCENE", help="these scenes; all by default")
@@ -120,8 +119,8 @@ def _rendered(names: list[str], out: str) -> int:
     return 1 if failed else 0
 
 
-def _chart(names: list[str], out: str, quick: bool) -> None:
-    """Study the scenes one by one; write PNG, CSV and one HTML page, print one table."""
+def _chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
+    """Study the scenes one by one; write PNG, CSV and one HTML page, print one table; or a page on the whole of each."""
     import matplotlib
 
     from physjax.checks import known
@@ -132,12 +131,36 @@ def _chart(names: list[str], out: str, quick: bool) -> None:
     names = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(SCENES)
     folder = writable_folder(out)
     matplotlib.use("Agg")
+    if whole:
+        return _reported(names, folder)
     results = [_study(name, folder, quick) for name in names]
     summary = _summary([result for result, _ in results])
     with replacing(folder / "index.html") as file:
         file.write(report.page("physjax: speed against accuracy", summary, [section for _, section in results]))
     print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
     print(f"Measured on {report.machine()}.\nCharts: {folder / 'index.html'}")
+
+
+def _reported(names: list[str], folder: Path) -> None:
+    """Write a page on each scene, with its parts as progress."""
+    import jax
+
+    from physjax.files import replacing
+    from physjax.scenes import SCENES, title
+    from physjax.show.report import page
+    from physjax.study.scene_report import PARTS, sections
+
+    for name in names:
+        with jax.enable_x64(True):
+            problem = SCENES[name]()
+        with tqdm(total=len(PARTS), desc=f"{name:<16}", unit="part", file=sys.stderr) as bar:
+            told = []
+            for section in sections(problem, name, title(name), progress=bar.set_postfix_str):
+                told.append(section)
+                bar.update()
+        with replacing(folder / f"{name}.html") as file:
+            file.write(page(name.replace("_", " "), "", told))
+        print(f"Report: {folder / f'{name}.html'}", flush=True)
 
 
 def _stability(name: str, out: str, steps: int) -> None:
@@ -153,6 +176,7 @@ def _stability(name: str, out: str, steps: int) -> None:
     from physjax.stepping.methods import METHODS
     from physjax.study import stability
     from physjax.study.limits import name_of
+    from physjax.study.survey import fastest_moment, map_around
 
     name, steps = known("scene", name, SCENES | FAILURES), positive_integer("steps", steps, at_least=64)
     folder = writable_folder(out)
@@ -160,7 +184,7 @@ def _stability(name: str, out: str, steps: int) -> None:
     with jax.enable_x64(True):
         problem = (SCENES | FAILURES)[name]()
     scene = problem.scene
-    time, at = _fastest_moment(problem) if name in SCENES else (0.0, scene.state)
+    time, at = fastest_moment(problem) if name in SCENES else (0.0, scene.state)
     unstable = bool(stability.grows_by_itself(scene, at).any())
     rows, limits = [], []
     for method in tqdm(METHODS.values(), desc=name, unit="method", file=sys.stderr):
@@ -169,7 +193,7 @@ def _stability(name: str, out: str, steps: int) -> None:
         measured = (
             float(stability.measure_limit(scene, method, at, steps=steps).min()) if finite and not unstable else None
         )
-        limits += [predicted.dt] if finite else []
+        limits.append(predicted)
         rows.append(
             [
                 predicted.method,
@@ -181,8 +205,8 @@ def _stability(name: str, out: str, steps: int) -> None:
     print(f"About the state at t = {time:.4g} s, where the scene is fastest.")
     if unstable:
         print("There its own motion takes neighbours apart, whatever the method: nothing to be measured.")
-    if limits:
-        chart = stability.map(scene, list(METHODS.values()), np.geomspace(min(limits) / 10, 3 * max(limits), 48))
+    chart = map_around(scene, limits)
+    if chart is not None:
         with replacing(folder / f"{name}.png", "wb") as file:
             chart.plot().savefig(file, dpi=110)
         print(f"Map: {folder / f'{name}.png'}")
@@ -192,24 +216,6 @@ def _stability(name: str, out: str, steps: int) -> None:
         told = stability.explain(scene, problem.method, problem.dt, steps=problem.steps)
         print(f"{name_of(problem.method)} with dt = {seconds_text(problem.dt)}: {told}")
     print(f"Measured on {machine()}.")
-
-
-def _fastest_moment(problem: Any) -> tuple[float, Any]:
-    """The moment [s] of a run, of a few, at which small motions are fastest, and the state then."""
-    import jax
-    import numpy as np
-
-    from physjax.study.small_motion import about, small_motion
-
-    flight = problem.reference()
-
-    def pace(i: int) -> float:
-        with jax.enable_x64(True):
-            return float(np.abs(small_motion(*about(problem.scene, state(i))).rates()).max())
-
-    state = lambda i: jax.tree.map(lambda leaf: leaf[i], flight.state)  # noqa: E731
-    fastest = max(range(0, len(flight.time), max(1, len(flight.time) // MOMENTS)), key=pace)
-    return float(flight.time[fastest]), state(fastest)
 
 
 def _limit_texts(predicted: float, measured: float | None) -> list[str]:
@@ -322,11 +328,10 @@ def _range(text: str) -> tuple[str, Any]:
 def _study(name: str, folder: Path, quick: bool):
     """One scene: its work-precision study, with PNG and CSV written; the result and its section of the page."""
     import jax
-    from matplotlib import pyplot as plt
 
     from physjax.files import replacing
     from physjax.scenes import SCENES, title
-    from physjax.show.report import Section
+    from physjax.show.report import Section, Table, drawn
     from physjax.stepping.methods import METHODS
     from physjax.study import accuracy
 
@@ -342,14 +347,11 @@ def _study(name: str, folder: Path, quick: bool):
         budget = accuracy.QUICK if quick else accuracy.THOROUGH
         result = accuracy.work_precision(problem, rivals=rivals, budget=budget, name=name, progress=progress)
         bar.set_postfix_str("done")
-    figure = result.plot()
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=110)
-    plt.close(figure)
+    picture = drawn(result.plot(), f"charts of {name}")
     with replacing(folder / f"{name}.png", "wb") as file:
-        file.write(picture.getvalue())
+        file.write(picture.data)
     result.to_csv(folder / f"{name}.csv")
-    return result, Section(name, title(name), picture.getvalue(), result.table())
+    return result, Section(name, title(name), picture, Table(result.table()))
 
 
 def _summary(results: list) -> str:

@@ -10,9 +10,6 @@ from physjax.physics.springs import Springs
 from physjax.scenes.gallery import SCENES, title
 from physjax.study.problem import Problem
 
-FRAMES = 512
-"""A run is drawn from at least so many moments."""
-
 
 class Entry(NamedTuple):
     """A scene by name: its one-line description, how large it is, and the truths that it is tested by."""
@@ -69,7 +66,7 @@ def _draw(name: str, folder: Path) -> Entry:
     from physjax.show import portrait
 
     told, problem = entry(name)
-    run = problem._replace(frames=max(problem.frames, FRAMES)).reference()
+    run = problem.filmed()
     figure = portrait.still(run, problem.looks)
     with replacing(folder / f"{name}.png", "wb") as file:
         figure.savefig(file, dpi=125, bbox_inches="tight")

@@ -77,6 +77,12 @@ class Film:
             self._write_gif(file, progress)
         return path
 
+    def gif(self) -> bytes:
+        """The film as a GIF in memory, for a page that holds it."""
+        file = io.BytesIO()
+        self._write_gif(file, progress=False)
+        return file.getvalue()
+
     def _repr_html_(self) -> str:
         page, height = self._player(progress=True)
         return framed(page, height + TOOLS)

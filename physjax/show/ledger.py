@@ -58,7 +58,7 @@ def _totals(ax: Any, totals: dict[str, float], styles: dict[str, dict]) -> None:
     ax.set_yticks(places, list(totals))
     ax.set(
         xlabel="energy received [J]",
-        xlim=(min(values.min(), 0.0) - 0.22 * reach, max(values.max(), 0.0) + 0.22 * reach),
+        xlim=(min(values.min(), 0.0) - 0.3 * reach, max(values.max(), 0.0) + 0.3 * reach),
     )
     ax.invert_yaxis()
     ax.tick_params(axis="y", length=0)

@@ -320,4 +320,5 @@ def _legend(result: Any, method: str) -> str:
         return f"{method} (adaptive)"
     order = result.observed_order(method)
     seen = "exact" if math.isinf(order) else "order unseen" if math.isnan(order) else f"order {order:.2f}"
-    return f"{method}: {seen} (promised {result.promised[method]:.0f})"
+    promised = result.promised[method]
+    return f"{method}: {seen}" + ("" if math.isnan(promised) else f" (promised {promised:.0f})")

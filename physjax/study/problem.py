@@ -17,6 +17,9 @@ from physjax.trajectory import Trajectory
 FINE = 64
 """Steps of rk4 between two moments at which errors are measured, where diffrax cannot be the reference."""
 
+FILM = 512
+"""A run is drawn from at least so many moments."""
+
 
 class Truth(NamedTuple):
     """Something that must be true of a scene: `measure(flight)` equals `expected` within `tolerance` (absolute).
@@ -71,6 +74,10 @@ class Problem(NamedTuple):
             steps = FINE * self.frames
             flight = simulate(scene, methods.rk4, dt=self.duration / steps, steps=steps, save_every=FINE)
             return jax.tree.map(np.asarray, flight)
+
+    def filmed(self) -> Trajectory:
+        """The reference at moments enough for a picture without corners, and a film."""
+        return self._replace(frames=max(self.frames, FILM)).reference()
 
     def verify(self) -> list[tuple[Truth, np.ndarray, bool]]:
         """Every truth with the measured value and whether it holds."""

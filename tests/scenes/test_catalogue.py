@@ -36,7 +36,7 @@ def gallery(monkeypatch):
         monkeypatch.delitem(SCENES, name)
     for build in (fall, ruin, swing):
         monkeypatch.setitem(SCENES, build.__name__, build)
-    monkeypatch.setattr("physjax.scenes.catalogue.FRAMES", 16)
+    monkeypatch.setattr("physjax.study.problem.FILM", 16)
 
 
 def test_a_scene_is_told_with_its_size_and_its_truths():

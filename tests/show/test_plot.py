@@ -87,6 +87,10 @@ def test_the_legend_has_room_below_the_panels():
     assert legend.x1 <= figure.bbox.width
     assert legend.y1 <= min(ax.xaxis.get_tightbbox().y0 for ax in figure.axes)
     assert "projected at the end of the step" in figure.legends[0].get_title().get_text()
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert sum("promised" in label for label in labels) == len(runs) / len(study.runs)
+    unpromised = study._replace(promised={"verlet": float("nan")}).plot()
+    assert not any("promised" in text.get_text() for text in unpromised.legends[0].get_texts())
 
 
 def test_table_is_aligned():
@@ -106,9 +110,14 @@ def test_times_are_readable(seconds, text):
 
 
 def test_page_is_self_contained():
-    page = report.page("title", "a < b", [report.Section("kepler", "two bodies", b"png", "table")])
+    page = report.page(
+        "title",
+        "a < b",
+        [report.Section("kepler", "two bodies", report.Picture(b"png", "an orbit"), report.Table("a table"))],
+    )
     assert "a &lt; b" in page
     assert "data:image/png;base64," in page
     assert "src=" in page
+    assert 'alt="an orbit"' in page
     assert "http" not in page.replace("http-equiv", "")
     assert "jax " in page

@@ -1,0 +1,192 @@
+"""All that is told of a scene, part by part: picture, cost of accuracy, stability, ledger, ablation, recommendation."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from physjax.particles import Particles
+from physjax.physics.contacts import impact, project
+from physjax.scene import Scene
+from physjax.show import portrait
+from physjax.show.report import Picture, Section, Table, drawn, seconds_text
+from physjax.stepping.methods import METHODS
+from physjax.stepping.simulate import simulate
+from physjax.study import accuracy, energy, stability
+from physjax.study.problem import Problem
+from physjax.study.survey import fastest_moment, map_around
+from physjax.study.work_precision import ERRORS, Run, WorkPrecision
+
+WANTED = 1e-4
+"""Error, relative to the extent of the path, of the run whose books are closed and whose parts are left out."""
+TIMING = 3.0
+"""Time for the timings of the ablation [s]."""
+
+Block = str | Picture | Table
+
+
+class Studied(NamedTuple):
+    """A scene under a name, what it is in one sentence, and its work-precision study, which the parts draw upon."""
+
+    name: str
+    sentence: str
+    problem: Problem
+    precision: WorkPrecision
+
+    @property
+    def run(self) -> Run | None:
+        """The cheapest run of our methods that is as true as wanted, or the truest; None if none stayed on the path.
+
+        Of methods that follow an undamped swing as well: the ablation takes the damping away.
+        """
+        steady = {name for name, method in METHODS.items() if method.promises.stable_to > 0}
+        ours = [run for run in self.precision.runs if run.method in steady and run.status == "ok"]
+        true = [run for run in ours if run.path_error <= WANTED]
+        return (
+            min(true, key=lambda run: run.seconds) if true else min(ours, key=lambda run: run.path_error, default=None)
+        )
+
+    @property
+    def stepping(self) -> dict[str, Any]:
+        """That run as options of `simulate`."""
+        steps, problem = self.run.steps, self.problem
+        method, every = METHODS[self.run.method], steps // problem.frames
+        return {"method": method, "dt": problem.duration / steps, "duration": problem.duration, "save_every": every}
+
+    @property
+    def stepped(self) -> str:
+        """That run in words."""
+        run = self.run
+        return f"Stepped by {run.method} with dt = {seconds_text(run.dt)}, whose error is {run.path_error:.1e} of the path."
+
+
+def sections(
+    problem: Problem,
+    name: str,
+    sentence: str,
+    *,
+    budget: accuracy.Budget = accuracy.QUICK,
+    progress: Callable[[str], None] = lambda what: None,
+) -> Iterator[Section]:
+    """The `PARTS` of a scene's page, in the order of reading; what cannot be had for a scene says why in one sentence.
+
+    `sentence` says what the scene is. `progress(what)` is called before each part.
+    """
+    progress("reference and runs")
+    precision = accuracy.work_precision(problem, budget=budget, name=name)
+    studied = Studied(name, sentence, problem, precision)
+    for heading, part in PARTS.items():
+        progress(heading)
+        with jax.enable_x64(True):
+            section = Section(heading, *part(studied))
+        yield section
+
+
+def _seen(studied: Studied) -> Iterator[Block]:
+    yield studied.sentence
+    run, looks = studied.problem.filmed(), studied.problem.looks
+    yield drawn(portrait.still(run, looks), f"Picture: {studied.sentence}")
+    yield Picture(portrait.moving(run, looks).gif(), f"Film: {studied.sentence}", kind="gif")
+
+
+def _charted(studied: Studied) -> Iterator[Block]:
+    precision = studied.precision
+    yield (
+        "Every method from coarse to fine steps. Errors are relative to the extent of the path, measured against: "
+        f"{precision.truth}. The table has the shortest run time for each error."
+    )
+    yield drawn(precision.plot(), f"Charts of error against run time and step for each method in {studied.name}.")
+    yield Table(precision.table())
+
+
+def _stable(studied: Studied) -> Iterator[Block]:
+    scene = studied.problem.scene
+    if not isinstance(scene.state, Particles):
+        yield "No map: the limits are those of small motions in a straight line, and rigid bodies turn."
+        return
+    if scene.emitter is not None:
+        yield "No map: particles are born and die, so there is no one motion that could be stable."
+        return
+    time, at = fastest_moment(studied.problem)
+    limits = [stability.limit(scene, method, at) for method in METHODS.values()]
+    yield f"The longest stable step about t = {time:.3g} s, where the scene is fastest:"
+    yield from map(str, limits)
+    if stability.grows_by_itself(scene, at).any():
+        yield "Neighbours part there by the scene's own motion, whatever the method."
+    timed = any(contact.response is impact for contact in scene.contacts)
+    chart = map_around(Scene(scene.state, scene.mass, scene.forces, pinned=scene.pinned) if timed else scene, limits)
+    if chart is None:
+        yield "No map: no method has a limit here."
+        return
+    yield (
+        f"Runs from the start{', without their touches' if timed else ''}, judged by their error; the black line is the "
+        "limit predicted at their start."
+    )
+    yield drawn(
+        chart.plot(), f"Map of the steps at which each method is stable, inaccurate or diverged in {studied.name}."
+    )
+
+
+def _ledger(studied: Studied) -> Iterator[Block]:
+    scene = studied.problem.scene
+    if scene.emitter is not None:
+        yield "No ledger: particles bring energy when they are born and take it when they die."
+        return
+    if any(contact.response not in (impact, project) for contact in scene.contacts):
+        yield "No ledger: a contact has a response of its own, and what it does to a touch is not known."
+        return
+    if studied.run is None:
+        yield NO_RUN
+        return
+    books = energy.ledger(simulate(scene, **studied.stepping))
+    yield studied.stepped
+    yield drawn(books.plot(), f"Chart of where the energy of {studied.name} went over time.")
+    yield Table(str(books))
+
+
+def _ablated(studied: Studied) -> Iterator[Block]:
+    scene = studied.problem.scene
+    if scene.emitter is not None:
+        yield "No ablation: without one of its parts other particles would be born, and there would be no two ends to compare."
+        return
+    if not (scene.forces or scene.contacts):
+        yield "No ablation: the scene has neither forces nor contacts that could be left out."
+        return
+    if studied.run is None:
+        yield NO_RUN
+        return
+    extent = float(np.ptp(studied.precision.path[1], axis=0).max())
+    found = accuracy.ablate(
+        scene,
+        lambda flight: flight.position[-1],
+        scale=extent,
+        seconds=TIMING,
+        **studied.stepping,
+    )
+    yield (
+        f"What each part is worth for where everything ends: what counts is a thousandth of the extent of the path, "
+        f"{extent:.3g} m. {studied.stepped}"
+    )
+    yield drawn(found.plot(), f"Chart of how much each part of {studied.name} changes where it ends.")
+    yield Table(str(found))
+
+
+def _recommended(studied: Studied) -> Iterator[Block]:
+    problem = studied.problem
+    answers = accuracy.recommend(problem.scene, error=ERRORS, horizon=problem.duration, progress=False)
+    for answer in answers:
+        yield f"For an error of {answer.error:g}: {answer.reason}"
+    yield Table("\n\n".join(map(str, answers)))
+
+
+NO_RUN = "Not to be had: no run with a fixed step stayed on the path."
+PARTS = {
+    "scene": _seen,
+    "speed against accuracy": _charted,
+    "stability": _stable,
+    "energy ledger": _ledger,
+    "ablation": _ablated,
+    "recommendation": _recommended,
+}
+"""The parts of a page by their headings, in the order of reading."""
