@@ -77,7 +77,7 @@ def treatments(scene: Scene) -> dict[str, Scene]:
         else contact
         for contact in scene.contacts
     ]
-    return {"": scene, PROJECTED: Scene(scene.state, scene.mass, scene.forces, project, scene.pinned)}
+    return {"": scene, PROJECTED: Scene(scene.state, scene.mass, scene.forces, project, scene.pinned, scene.emitter)}
 
 
 def method_runs(contest: Contest, scene: Scene, method: Callable, suffix: str, dtype: Any) -> list[Run]:

@@ -41,6 +41,8 @@ def flattened(scene: Scene, flight: Any) -> tuple[Scene, Any] | str:
     """The scene without the axis along which nothing moves, with what gives its states that axis back; or why there is none."""
     if not isinstance(scene.state, Particles) or scene.led is not None:
         return "bodies turn in space, and lanes are led along paths in space"
+    if scene.emitter is not None:
+        return "particles are born in space"
     axis = _still_axis(flight)
     if axis is None:
         return "something moves along every axis"

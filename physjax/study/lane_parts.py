@@ -29,6 +29,10 @@ def one_lane(scene: Scene, lane: int | tuple[int, ...]) -> Scene:
 
 def with_lanes(scene: Scene, shape: tuple[int, ...], cut: Callable) -> Scene:
     """The scene with `cut(array)` for every array that has an entry for each of lanes of this shape."""
+    if scene.emitter is not None:
+        raise ValueError(
+            "lanes: got a scene with an emitter, expected lanes that live from the start: births fill its whole pool."
+        )
     parts = [_part(part, shape, cut) for part in (*scene.forces, *scene.contacts)]
     count = len(scene.forces)
     numbers = partial(_cut, cut, shape, False)

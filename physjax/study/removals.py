@@ -70,7 +70,7 @@ def _with(scene: Scene, kind: str, i: int, *instead: Any) -> Scene:
     """The scene with something instead of one of its forces or contacts, or nothing."""
     parts = getattr(scene, kind)
     parts = {"forces": scene.forces, "contacts": scene.contacts} | {kind: (*parts[:i], *instead, *parts[i + 1 :])}
-    return Scene(scene.state, scene.mass, parts["forces"], parts["contacts"], scene.pinned)
+    return Scene(scene.state, scene.mass, parts["forces"], parts["contacts"], scene.pinned, scene.emitter)
 
 
 def _simpler(name: str, part: Any) -> list[tuple[str, Any]]:

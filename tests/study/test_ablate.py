@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, accuracy, contacts, forces, lattices, methods, reference, simulate
+from physjax import Particles, Scene, accuracy, contacts, emitters, forces, lattices, methods, reference, simulate
 from physjax.scenes import SCENES
 from physjax.scenes.gallery import table
 from physjax.study.ablate import COSTLY, NEEDED, NEGLIGIBLE, NONE, _verdicts
@@ -122,6 +122,20 @@ def test_a_float32_program_counts_steps_as_simulate_does():
         told = accuracy.ablate(ball, lambda f: f.position[-1, 0], **run)
     assert told.dt == 0.01
     assert told["Gravity"].verdict == NONE  # it pulls across
+
+
+def test_what_is_born_stays_born_when_something_else_is_left_out():
+    jet = emitters.Emitter(
+        60, emitters.Point((0.0, 0.0, 0.0)), key=1, life=1.0, rate=50.0, speed=6.0, direction=(0, 1, 0)
+    )
+    fountain = Scene(jet.unborn(), 1e-3, (forces.Gravity(), forces.QuadraticDrag(1e-4, 0.4)), emitter=jet)
+    told = accuracy.ablate(
+        fountain, lambda film: film.position[-1, :, 1].max(), method=methods.rk4, dt=0.01, duration=1.0, **UNTIMED
+    )
+    # without gravity the first to be born flies at its speed, but for the drag
+    assert 3.0 < told["Gravity"].outcome < 6.0
+    assert told["Gravity"].verdict == told["QuadraticDrag"].verdict == NEEDED
+    assert told.notes == ("third dimension kept: particles are born in space",)
 
 
 def test_the_third_dimension_stays_where_something_leaves_the_plane():
