@@ -161,7 +161,8 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
         life=life,
         speed=fall,
         direction=(0.0, -1.0, 0.0),
-        look=emitters.Look(colour=((0.9, 0.95, 1.0),) * 2),
+        size=0.06,
+        look=emitters.Look(colour=((0.35, 0.55, 0.8),) * 2),
     )
     ground = contacts.Plane((0.0, 0.0, 0.0), UP, restitution=0.0, friction=1.0)
     air = forces.StokesDrag(mass * g / fall, wind=(wind, 0.0, 0.0))
