@@ -20,8 +20,8 @@ from physjax.checks import concrete, demand, positive_integer, quantity
 from physjax.lanes import on_runs
 from physjax.particles import Particles, demand_particles
 from physjax.physics.looks import Appearance, Look
-from physjax.physics.sources import Box, Disc, Mesh, Point, Source, Sphere, in_cone
-from physjax.vectors import components, over, scale, stacked, unit
+from physjax.physics.sources import Box, Disc, Mesh, Point, Source, Sphere, direction_of, in_cone, rounded
+from physjax.vectors import components, over, scale, stacked
 
 _DRAWS = 8
 """Uniform numbers of a birth: three for the place, two for the direction, then speed, life and size."""
@@ -50,7 +50,8 @@ class Emitter(eqx.Module):
     many seconds, from the time `start` on; with neither, once. A particle leaves with `speed` [m/s] in a direction
     within the half-angle `cone` [rad] about `direction`, by default about the way out of the source, and lives for
     `life` [s]. Of speed, life and size [m] each particle has its own, even within mean·(1 ± spread). `key` is a seed or a
-    `jax.random.key`.
+    `jax.random.key`. With `opposed`, bursts are of pairs: the second leaves like the first, the other way round, so that
+    their momentum is zero.
 
     Every number but the counts can be swept and differentiated (births at fixed generations). A slot that is needed
     again before its particle has died is an error that names the pool needed; with `drop_oldest` the oldest makes way.
@@ -81,6 +82,7 @@ class Emitter(eqx.Module):
     life_spread: Float[Array, ""] = quantity("spread of the life", "1", at_least=0, default=0.0, kw_only=True)
     size_spread: Float[Array, ""] = quantity("spread of the size", "1", at_least=0, default=0.0, kw_only=True)
     look: Look = eqx.field(default_factory=Look, kw_only=True)
+    opposed: bool = eqx.field(static=True, default=False, kw_only=True)
     drop_oldest: bool = eqx.field(static=True, default=False, kw_only=True)
     slot: Int[Array, "pool"] | None = eqx.field(default=None, kw_only=True)
     generation: Int[Array, "..."] | None = eqx.field(default=None, kw_only=True)
@@ -99,6 +101,8 @@ class Emitter(eqx.Module):
                 raise ValueError("burst: got a number without every=, the time between bursts [s]. Give both.")
             if self.pool % positive_integer("burst", self.burst):
                 raise ValueError(f"burst: got {self.burst}, expected a divisor of the pool of {self.pool}.")
+        if self.opposed and self._burst % 2:
+            raise ValueError(f"opposed: got births {self._burst} at a time, expected bursts of an even number.")
         for name, value in (("life", self.life_spread), ("size", self.size_spread)):
             if concrete(value) is not None:
                 demand(f"spread of the {name} [1]", value, concrete(value) < 1, "numbers from 0 to below 1")
@@ -158,17 +162,22 @@ class Emitter(eqx.Module):
         """The births of these slots in these generations, drawn from the key folded with both."""
         u = self._drawn(slot, generation)
         place, outward = self.source(u[:, :3])
-        axis = outward if self.direction is None else over(unit(self.direction), outward)
+        axis = outward if self.direction is None else over(direction_of(self.direction), outward)
+        speed = _spread(self.speed, self.speed_spread, u[:, 5])
+        if self.opposed:
+            speed = jnp.where(slot % 2 == 0, speed, -speed)
         return Birth(
             time=self.birth_time(slot, generation),
             life=_spread(self.life, self.life_spread, u[:, 6]),
             size=_spread(self.size, self.size_spread, u[:, 7]),
             position=place,
-            velocity=scale(_spread(self.speed, self.speed_spread, u[:, 5]), in_cone(axis, self.cone, u[:, 3:5])),
+            velocity=scale(speed, in_cone(axis, self.cone, u[:, 3:5])),
         )
 
     def _drawn(self, slot: Array, generation: Array) -> Array:
         key = jax.random.wrap_key_data(self.key, impl="threefry2x32")
+        # the second of a pair has the numbers of the first
+        slot = slot - slot % 2 if self.opposed else slot
 
         def one(slot, generation):
             own = jax.random.fold_in(jax.random.fold_in(key, slot), generation)
@@ -269,7 +278,7 @@ class Emitter(eqx.Module):
 
 def _spread(mean: Array, spread: Array, u: Array) -> Array:
     """Even within mean·(1 ± spread)."""
-    return mean * (1.0 + spread * (2.0 * u - 1.0))
+    return rounded(mean * (1.0 + rounded(spread * (2.0 * u - 1.0))))
 
 
 def _chosen(flag: Array, a: Array, b: Array) -> Array:

@@ -2,6 +2,9 @@
 
 A source is called with uniform numbers `(*lanes, 3)` and returns the place [m] and the direction out of the shape there,
 both `(*lanes, dim)`. Its numbers can be swept and differentiated; where a particle is born moves with them.
+
+Births have the same bits in every program: products are `rounded` before they are added, which compilers would
+otherwise do or leave as it suits the rest of the program.
 """
 
 import math
@@ -13,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from physjax.checks import concrete, demand, quantity
-from physjax.vectors import components, cross, norm, over, scale, stacked, turn_left, unit
+from physjax.vectors import components, over, scale, stacked, turn_left
 
 
 class Source(eqx.Module):
@@ -77,12 +80,12 @@ class Disc(Source):
 
     def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
         """r = R √u₀ at the angle 2πu₁, and the normal."""
-        normal = over(unit(self.normal), u[..., : self.dim])
+        normal = over(direction_of(self.normal), u[..., : self.dim])
         if self.dim == 2:
             across = scale(2.0 * u[..., 0] - 1.0, turn_left(normal))
         else:
             across = scale(jnp.sqrt(u[..., 0]), around(normal, 2 * math.pi * u[..., 1]))
-        return over(self.center, normal) + self.radius * across, normal
+        return over(self.center, normal) + rounded(self.radius * rounded(across)), normal
 
 
 class Box(Source):
@@ -112,7 +115,9 @@ class Box(Source):
         share = u[..., : self.dim]
         # the place has taken the numbers; what is left after a stretch is as even, and independent of where that was
         again = jnp.mod(4096.0 * u, 1.0)
-        return over(self.lower, share) + over(self.upper - self.lower, share) * share, isotropic(again, self.dim)
+        return over(self.lower, share) + rounded(over(self.upper - self.lower, share) * share), isotropic(
+            again, self.dim
+        )
 
 
 class Sphere(Source):
@@ -137,7 +142,7 @@ class Sphere(Source):
         """R ∛u₂ (in the plane R √u₂) along an isotropic direction, which is also the outward one."""
         outward = isotropic(u, self.dim)
         share = jnp.ones_like(u[..., 2]) if self.shell else u[..., 2] ** (1 / self.dim)
-        return over(self.center, outward) + self.radius * scale(share, outward), outward
+        return over(self.center, outward) + rounded(self.radius * rounded(scale(share, outward))), outward
 
 
 class Mesh(Source):
@@ -176,13 +181,13 @@ class Mesh(Source):
     def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
         """A face by its share of the area, then a + (1 - √u₁)(b - a) + √u₁u₂(c - a) in it; and the face's normal."""
         corner = [jnp.take(self.vertices[0], self.faces[0, :, i], axis=0) for i in range(3)]
-        upto = jnp.cumsum(norm(cross(corner[1] - corner[0], corner[2] - corner[0])))
+        normal = _cross(corner[1] - corner[0], corner[2] - corner[0])
+        upto = jnp.cumsum(_length(normal))
         face = jnp.searchsorted(upto, u[..., 0] * upto[-1], side="right")
         face = jnp.minimum(face, self.faces.shape[1] - 1).astype(jnp.int32)
-        a, b, c = (jnp.take(each, face, axis=0) for each in corner)
+        a, b, c, outward = (jnp.take(each, face, axis=0) for each in (*corner, direction_of(normal)))
         root = jnp.sqrt(u[..., 1])
-        place = a + scale(1 - root, b - a) + scale(root * u[..., 2], c - a)
-        return place, unit(cross(b - a, c - a))
+        return a + rounded(scale(1 - root, b - a)) + rounded(scale(root * u[..., 2], c - a)), outward
 
 
 def isotropic(u: Float[Array, "*lanes 3"], dim: int) -> Float[Array, "*lanes dim"]:
@@ -204,10 +209,13 @@ def in_cone(
     """
     if axis.shape[-1] == 2:
         angle = cone * (2.0 * u[..., 0] - 1.0)
-        return scale(jnp.cos(angle), axis) + scale(jnp.sin(angle), turn_left(axis))
-    half = u[..., 0] * jnp.sin(cone / 2) ** 2
-    sine = 2.0 * jnp.sin(cone / 2) * jnp.sqrt(u[..., 0] * (1.0 - half))
-    return scale(1.0 - 2.0 * half, axis) + scale(sine, around(axis, 2 * math.pi * u[..., 1]))
+        return rounded(scale(jnp.cos(angle), axis)) + rounded(scale(jnp.sin(angle), turn_left(axis)))
+    # a bound beyond π, so that the sine is computed with the births: compilers have another for constants
+    edge = jnp.sin(jnp.minimum(cone / 2, 2.0 + u[..., 0]))
+    half = rounded(u[..., 0] * rounded(edge * edge))
+    sine = 2.0 * edge * jnp.sqrt(u[..., 0] * (1.0 - half))
+    sideways = around(axis, 2 * math.pi * u[..., 1])
+    return rounded(scale(1.0 - 2.0 * half, axis)) + rounded(scale(sine, sideways))
 
 
 def around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Float[Array, "*lanes 3"]:
@@ -220,6 +228,26 @@ def around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Flo
     sign = jnp.where(z < 0, -1.0, 1.0).astype(z.dtype)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = stacked([1.0 + sign * x * x * a, sign * b, -sign * x])
-    second = stacked([b, sign + y * y * a, -y])
-    return scale(jnp.cos(angle), first) + scale(jnp.sin(angle), second)
+    first = stacked([1.0 + rounded(sign * x * x * a), sign * b, -sign * x])
+    second = stacked([b, sign + rounded(y * y * a), -y])
+    return rounded(scale(jnp.cos(angle), first)) + rounded(scale(jnp.sin(angle), second))
+
+
+def rounded(product: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The product as it is, rounded before anything is added to it: no compiler may contract both across this bound."""
+    return jnp.maximum(product, jnp.finfo(product.dtype).min)
+
+
+def direction_of(vector: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    """v/|v|, NaN of the zero vector, with the same bits in every program."""
+    return vector / _length(vector)[..., None]
+
+
+def _length(vector: Array) -> Array:
+    return jnp.sqrt(sum(rounded(each * each) for each in components(vector)))
+
+
+def _cross(a: Array, b: Array) -> Array:
+    (x, y, z), (p, q, r) = components(a), components(b)
+    parts = ((y * r, z * q), (z * p, x * r), (x * q, y * p))
+    return stacked([rounded(one) - rounded(other) for one, other in parts])

@@ -124,8 +124,10 @@ def paths(
     return Film(scenery, frames, fps, draw, axes=axes)
 
 
-def particles(film: Trajectory, *, fps: int | float = 30.0, speed: int | float = 1.0) -> Film:
-    """Particles that are born and die, with the size, colour and opacity of their age; see `plot.particles`.
+def particles(
+    film: Trajectory, *, density: bool | None = None, fps: int | float = 30.0, speed: int | float = 1.0
+) -> Film:
+    """Particles that are born and die, with the size, colour and opacity of their age, or their `density`; see `plot.particles`.
 
     Raises TypeError or ValueError for a run without an emitter, and for `fps` or `speed` that do not fit.
 
@@ -135,9 +137,9 @@ def particles(film: Trajectory, *, fps: int | float = 30.0, speed: int | float =
         11
     """
     who = "animate.particles"
-    seen, draw = cloud_of(who, film)
+    seen, draw, bar = cloud_of(who, film, density)
     frames, fps = schedule(who, seen, fps, speed)
-    return Film(scenery_of(seen, frames), frames, fps, draw)
+    return Film(scenery_of(seen, frames), frames, fps, draw, bar=bar)
 
 
 __all__ = ["Film", "View", "bodies", "cloth", "particles", "paths", "springs", "view"]

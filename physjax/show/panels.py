@@ -91,6 +91,15 @@ def arranged(figure: Any, scenery: Scenery, count: int, bar: Any = None) -> list
     return drawn
 
 
+def bar_below(figure: Any, where: dict[str, Any], colours: Any, label: str, *, extend: str) -> None:
+    """A colour bar below all panels, where `arranged` has room for it."""
+    size = {} if "cax" in where else {"shrink": 0.6, "aspect": 40, "pad": 0.04, "location": "bottom"}
+    bar = figure.colorbar(colours, orientation="horizontal", extend=extend, **size, **where)
+    bar.set_label(label, fontsize=9)
+    bar.ax.tick_params(labelsize=8, colors="0.35")
+    bar.outline.set_visible(False)
+
+
 def _grid(scenery: Scenery, count: int) -> tuple[int, int]:
     """Rows and columns of panels: up to three side by side; in the plane what is wide one above the other, up to three."""
     across, up = (scenery.stage.high - scenery.stage.low)[:2] if scenery.flat else (1, 1)

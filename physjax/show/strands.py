@@ -8,7 +8,7 @@ import numpy as np
 
 from physjax.physics.springs import Springs
 from physjax.show import obstacles
-from physjax.show.panels import Scenery, panels, scenery_of
+from physjax.show.panels import Scenery, bar_below, panels, scenery_of
 from physjax.show.takes import Take, batch_index, picked, springs_of, take, unbroken
 from physjax.trajectory import Trajectory
 
@@ -127,11 +127,7 @@ def lines(ax: Any, scenery: Scenery, frame: int, *, strands: Strands) -> list[An
 
 def colour_bar(figure: Any, where: dict[str, Any], *, strands: Strands) -> None:
     """What the colours mean, below all panels."""
-    size = {} if "cax" in where else {"shrink": 0.6, "aspect": 40, "pad": 0.04, "location": "bottom"}
-    bar = figure.colorbar(strands.colours(), orientation="horizontal", extend="both", **size, **where)
-    bar.set_label("strain [%]", fontsize=9)
-    bar.ax.tick_params(labelsize=8, colors="0.35")
-    bar.outline.set_visible(False)
+    bar_below(figure, where, strands.colours(), "strain [%]", extend="both")
 
 
 def _collection(ends: np.ndarray, **style: Any) -> Any:

@@ -108,6 +108,29 @@ def test_alone_and_in_a_batch_births_have_the_same_bits(precision, pool):
         assert np.abs(alone[0] - batch[0][i]).max() <= tolerance * np.abs(alone[0]).max()
 
 
+@pytest.mark.parametrize("name", ["disc", "shell"])
+def test_births_have_the_same_bits_in_every_program(precision, name):
+    """Whether their numbers are arguments or constants that the compiler computes with, and in any part of the pool."""
+    emitter = fountain(601, rate=500.0, source=SOURCES[name], direction=(0.6, 0.3, 0.2), cone=0.7)._cast(
+        precision.dtype
+    )
+    slot, generation = emitter.slot, jnp.ones_like(emitter.slot)
+    births = emitter.births(slot, generation)
+    closed = jax.jit(lambda generation: emitter.births(slot, generation))(generation)
+    part = emitter.births(slot[100:194], generation[100:194])
+    for whole, constant, few in zip(births, closed, part, strict=True):
+        assert np.array_equal(whole, constant)
+        assert np.array_equal(whole[100:194], few)
+
+
+def test_the_momentum_of_opposed_pairs_is_zero():
+    emitter = fountain(400, rate=None, every=0.5, burst=100, opposed=True)
+    births = emitter.births(emitter.slot, jnp.zeros_like(emitter.slot))
+    assert np.array_equal(births.velocity[0::2], -births.velocity[1::2])
+    assert np.array_equal(births.position[0::2], births.position[1::2])
+    assert np.unique(np.abs(births.velocity[:, 1])).size == 200
+
+
 def test_other_keys_have_the_same_statistics():
     """Means of speed, life, size, place and height within three standard errors of what the numbers say."""
     emitter = fountain(20_000, life_spread=0.3)
@@ -256,6 +279,7 @@ def test_a_look_goes_by_the_share_of_life():
         ({"every": 1.0}, "expected one of them"),
         ({"rate": None, "burst": 10}, "without every="),
         ({"rate": None, "burst": 7, "every": 1.0}, "a divisor of the pool of 1200"),
+        ({"opposed": True}, "expected bursts of an even number"),
         ({"cone": 4.0}, "from 0 to π"),
         ({"life_spread": 1.0}, "below 1"),
     ],

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, animate, emitters, forces, methods, plot, simulate
+from physjax.show import lights
 
 
-def spray():
-    look = emitters.Look(size=(1.0, 2.0), colour=((1.0, 0.5, 0.0), (0.0, 0.5, 1.0)), opacity=(1.0, 0.2))
+def spray(glows=False):
+    look = emitters.Look(size=(1.0, 2.0), colour=((1.0, 0.5, 0.0), (0.0, 0.5, 1.0)), opacity=(1.0, 0.2), glows=glows)
     jet = emitters.Emitter(
         60,
         emitters.Point((0.0, 0.0)),
@@ -37,6 +38,26 @@ def test_dots_are_those_alive_and_age():
         points = 72 / figure.dpi * np.ptp(ax.transData.transform([(0, 0), (1, 0)])[:, 0])  # a metre
         np.testing.assert_allclose(wide, points * 0.1 * (1 + age[alive]), rtol=1e-9)
     assert len(animate.particles(film, fps=10).frames) == 13
+
+
+def test_the_light_of_what_glows_adds_up():
+    paper, wide = np.asarray([[30.5, 20.5], [30.5, 20.5], [70.5, 20.5]]), np.full(3, 16.0)
+    seen = lights.glow(paper, wide, np.asarray([[0.2, 0.1, 0.0]] * 3), (41, 101))
+    light = seen[..., :3] * seen[..., 3:]
+    np.testing.assert_allclose(light[20, [30, 70]], [[0.4, 0.2, 0.0], [0.2, 0.1, 0.0]], atol=1e-6)
+    # a bell curve that at half the radius has fallen to e^-1/2
+    np.testing.assert_allclose(light[20, 74, 0], 0.2 * np.exp(-0.5), atol=1e-6)
+    (ax,) = plot.particles(spray(glows=True), frames=(60,)).axes
+    (image,) = [each for each in ax.artists if hasattr(each, "get_array")]
+    assert image.get_array()[..., 3].max() > 0.5
+
+
+def test_a_density_counts_all_that_are_alive():
+    film = spray()
+    panel, bar = plot.particles(film, frames=(60,), density=True).axes
+    (image,) = [each for each in panel.artists if hasattr(each, "get_array")]
+    assert image.get_array().sum() == np.asarray(film.film.emitter.alive(film.time))[60].sum()
+    assert "particles in a cell" in bar.get_xlabel()
 
 
 def test_a_run_without_an_emitter_is_refused():

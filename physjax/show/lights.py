@@ -1,0 +1,83 @@
+"""Pictures of many particles at once: light that adds up, and how many there are in a place."""
+
+from typing import Any
+
+import numpy as np
+
+CELL = 2.0
+"""Width of a cell in which particles are counted [points]."""
+NIGHT = (0.06, 0.06, 0.09)
+"""What glows is seen against this colour."""
+SIZES = 5
+"""Particles that glow are spread over the picture in so many groups of about one size."""
+
+
+def on_paper(ax: Any, position: np.ndarray) -> np.ndarray:
+    """Where points are in axes that have been laid out [pixels], from the lower left corner of the axes."""
+    ax.apply_aspect()
+    if position.shape[-1] == 3:
+        from mpl_toolkits.mplot3d import proj3d
+
+        position = np.stack(proj3d.proj_transform(*position.T, ax.get_proj())[:2], axis=-1)
+    return ax.transData.transform(position) - (ax.bbox.x0, ax.bbox.y0)
+
+
+def shape(ax: Any, cell: float = 1.0) -> tuple[int, int]:
+    """Rows and columns of the cells [pixels] that cover axes."""
+    return int(np.ceil(ax.bbox.height / cell)), int(np.ceil(ax.bbox.width / cell))
+
+
+def night(ax: Any, flat: bool) -> None:
+    """Darken the background of axes."""
+    if flat:
+        ax.set_facecolor(NIGHT)
+        return
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.set_pane_color((*NIGHT, 1.0))
+        axis._axinfo["grid"].update(color="0.3", linewidth=0.5)
+
+
+def glow(paper: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The sum of the lights of particles, each a bell curve as wide as the particle [pixels], as colours and opacity.
+
+    `light` is `(particles, 3)`, red, green and blue at the middle of a particle; what is brighter than 1 is seen as 1.
+    """
+    total = np.zeros((*shape, 3))
+    spread = np.maximum(wide / 4, 0.6)  # two standard deviations are its radius
+    for group in np.array_split(np.argsort(spread), min(SIZES, max(len(spread), 1))):
+        if not len(group):
+            continue
+        sigma = float(np.sqrt(np.mean(spread[group] ** 2)))
+        for i in range(3):
+            total[..., i] += _blurred(counted(paper[group], shape, 1.0, light[group, i]), sigma) * (
+                2 * np.pi * sigma**2
+            )
+    # black where there is light enough to hide the background, as the sum is over a dark one
+    cover = np.clip(total.max(axis=-1), 0.0, 1.0)
+    colour = np.clip(total, 0.0, 1.0) / np.maximum(cover, 1e-6)[..., None]
+    return np.concatenate([colour, cover[..., None]], axis=-1)
+
+
+def counted(paper: np.ndarray, shape: tuple[int, int], cell: float, weights: Any = None) -> np.ndarray:
+    """How many points are in each cell of a picture of `shape` (rows from below, columns), or the sum of their weights."""
+    edges = [np.arange(n + 1) * cell for n in shape]
+    return np.histogram2d(paper[:, 1], paper[:, 0], bins=edges, weights=weights)[0]
+
+
+def _blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
+    """The picture under a bell curve of area 1, by its Fourier transform, with a margin against what comes round."""
+    margin = int(np.ceil(4 * sigma))
+    padded = np.pad(picture, margin)
+    rows, columns = np.fft.fftfreq(padded.shape[0]), np.fft.rfftfreq(padded.shape[1])
+    damping = np.exp(-2 * (np.pi * sigma) ** 2 * (rows[:, None] ** 2 + columns**2))
+    blurred = np.fft.irfft2(np.fft.rfft2(padded) * damping, s=padded.shape)
+    return np.maximum(blurred[margin : margin + picture.shape[0], margin : margin + picture.shape[1]], 0.0)
+
+
+def picture(ax: Any, pixels: np.ndarray, **options: Any) -> Any:
+    """Lay an image over all of some axes, its first row below; returns the artist."""
+    from matplotlib.image import BboxImage
+
+    image = BboxImage(ax.bbox, origin="lower", interpolation="nearest", zorder=4, **options)
+    image.set_data(pixels)
+    return ax.add_artist(image)
