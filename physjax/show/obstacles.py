@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.physics.contacts import Plane, Room, Slab, Sphere
+from physjax.physics.hulls import Touch
 from physjax.scene import Contact
 from physjax.show.stage import Stage
 
@@ -35,8 +36,9 @@ class Ball(NamedTuple):
 
 
 def shown(contacts: tuple) -> tuple[Contact, ...]:
-    """The contacts that are the same for all lanes."""
-    return tuple(contact for contact in contacts if _is_shared(contact))
+    """The surfaces that are the same for all lanes; of what bodies touch with a hull, the surface."""
+    surfaces = (contact.surface if isinstance(contact, Touch) else contact for contact in contacts)
+    return tuple(surface for surface in surfaces if _is_shared(surface))
 
 
 def with_obstacles(stage: Stage, contacts: tuple, times: Sequence[float] = (0.0,)) -> Stage:
