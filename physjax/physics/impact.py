@@ -90,7 +90,7 @@ def _through_touches(
 ) -> tuple[Particles, tuple]:
     """The step again, leg by leg from touch to touch, of lanes that may meet something; the others are where they arrived."""
     leg, dt = _beginning(scene, dt)
-    state, since = _where(meets, (leg.state, leg.since), changing)
+    state, since = chosen(meets, (leg.state, leg.since), changing)
     leg = leg._replace(state=state, since=since, arrived=~meets)
 
     def go_on(leg, _):
@@ -164,7 +164,7 @@ def flights(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Ca
     def fly(leg, total):
         begun, _, start = _begun(scene, leg, t, dt)
         held = carried(scene, _walls(scene), start)
-        after = _where(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
+        after = chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
         duration = jnp.maximum(after.elapsed - leg.elapsed, hair(dt))
         end = motion(held, begun, duration).state
         return after, add(total, Flight(leg.state, held, begun, duration, end, after.state, ~leg.arrived))
