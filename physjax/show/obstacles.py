@@ -1,11 +1,12 @@
 """What is in the way, drawn lightly behind what moves: floors, walls, balls, rooms.
 
-In the plane any contact is drawn, by its gap; in space planes, slabs, spheres and rooms. Surfaces that differ from lane to
-lane are left out.
+In the plane any contact is drawn, by its gap; in space planes, slabs, spheres, rooms, and what has a `profile(low, high)`:
+a line `(n, 2)` of x and y [m] from one x to another, the same at every z. Surfaces that differ from lane to lane are left
+out.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -166,7 +167,14 @@ def sheets_of(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
         return [_cut(stage, _center(contact, t) + side * half * normal, normal) for side in (-1, 1)]
     if isinstance(contact, Room):
         return _walls(contact, t)
-    return []
+    return _extruded(contact.profile, stage) if hasattr(contact, "profile") else []
+
+
+def _extruded(profile: Callable, stage: Stage) -> list[np.ndarray]:
+    """The strips between the points of a line in the plane of x and y, from side to side of the box."""
+    line = np.asarray(profile(stage.low[0], stage.high[0]), float)
+    near, far = (np.column_stack([line, np.full(len(line), side)]) for side in (stage.low[2], stage.high[2]))
+    return list(np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=1))
 
 
 def _walls(room: Room, t: float) -> list[np.ndarray]:
