@@ -14,10 +14,10 @@ from physjax.trajectory import Trajectory
 
 AMBIENT = 0.5
 """Brightness of a face that stands edge on to the light."""
-
-
 SMOOTH = 0.85
 """Cosine of the angle up to which faces are drawn as one smooth surface."""
+AWAY = -0.3
+"""A face of a closed body is on its far side if its normal has less than this cosine with the direction to the eye."""
 
 
 def cloth(
@@ -43,8 +43,11 @@ def cloth(
     return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color), figure)
 
 
-def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any) -> list[Any]:
-    """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them."""
+def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any, closed: bool = False) -> list[Any]:
+    """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them.
+
+    Of what is `closed` the far side comes first: sorted by depth with the near one, some of it would show through.
+    """
     from matplotlib.colors import to_rgb
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -52,8 +55,10 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     faces = faces[scenery.stage.holds(position)[faces].all(axis=1)]
     triangles, colours = position[faces], brightness(position, faces)[:, None] * to_rgb(color)
     balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
-    behind = obstacles.hidden(balls, triangles.mean(axis=1), ax)
-    groups = [(triangles[behind], colours[behind], 2), (triangles[~behind], colours[~behind], 4)]
+    layers = np.where(obstacles.hidden(balls, triangles.mean(axis=1), ax), 2, 4)
+    if closed:
+        layers[_unit(_normals(triangles)) @ obstacles.towards_the_eye(ax) < AWAY] = 1
+    groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
     groups += [(ball.corners, obstacles.shades(ball), 3) for ball in balls]
     drawn = [
         Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
@@ -71,13 +76,18 @@ def brightness(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
     n at a corner is the mean of the faces around it, by area, so that a coarse sheet looks as smooth as it is meant;
     where they turn sharply, as on the edge of a block, it is the face's own.
     """
-    a, b, c = position[faces].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
+    normal = _normals(position[faces])
     corners, weights = faces.ravel(), np.repeat(normal, 3, axis=0)
     around = np.stack([np.bincount(corners, weights[:, i], len(position)) for i in range(3)], axis=-1)
     own, mean = _unit(normal)[:, None], _unit(around)[faces]
     smooth = (own * mean).sum(axis=-1, keepdims=True) > SMOOTH
     return AMBIENT + (1 - AMBIENT) * np.abs(np.where(smooth, mean, own) @ LIGHT).mean(axis=1)
+
+
+def _normals(triangles: np.ndarray) -> np.ndarray:
+    """Twice the area of each triangle, along its normal."""
+    a, b, c = triangles.transpose(1, 0, 2)
+    return np.cross(b - a, c - a)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -59,6 +59,14 @@ def test_pictures_and_films_are_drawn(tmp_path):
     assert film.save(tmp_path / "boxes.gif", progress=False).stat().st_size > 1000
 
 
+def test_the_far_side_of_a_body_is_drawn_before_its_near_one():
+    (ax,) = plot.bodies(FILM, [solids.box((1.0, 2.0, 3.0)), solids.sphere(1.0)], frames=-1).axes
+    layers = {c.get_zorder(): c for c in ax.collections if c.get_zorder() in (1, 4)}
+    far, near = (len(layers[order].get_facecolor()) for order in (1, 4))
+    assert far + near == 12 + len(solids.sphere(1.0).faces)
+    assert min(far, near) > 0.3 * (far + near)
+
+
 @pytest.mark.usefixtures("unannotated")
 def test_what_does_not_fit_is_refused_in_plain_words():
     ball = simulate(Scene(Particles(jnp.zeros(3), jnp.ones(3))), methods.verlet, dt=0.1, steps=1)
