@@ -112,18 +112,14 @@ def hidden(balls: list[Ball], points: np.ndarray, ax: Any) -> np.ndarray:
 
     Sorting polygons by depth, as matplotlib does, lets a ball show through the cloth that lies on it.
     """
-    eye, behind = towards_the_eye(ax), np.zeros(len(points), bool)
+    up, turn = np.radians([ax.elev, ax.azim])
+    eye = np.array([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)])
+    behind = np.zeros(len(points), bool)
     for ball in balls:
         away = points - ball.center
         depth = away @ eye
         behind |= (depth < 0) & ((away * away).sum(axis=-1) - depth**2 < ball.radius**2)
     return behind
-
-
-def towards_the_eye(ax: Any) -> np.ndarray:
-    """The direction from which axes in space are seen."""
-    up, turn = np.radians([ax.elev, ax.azim])
-    return np.array([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)])
 
 
 def shades(ball: Ball) -> np.ndarray:

@@ -16,8 +16,6 @@ AMBIENT = 0.5
 """Brightness of a face that stands edge on to the light."""
 SMOOTH = 0.85
 """Cosine of the angle up to which faces are drawn as one smooth surface."""
-AWAY = -0.3
-"""A face of a closed body is on its far side if its normal has less than this cosine with the direction to the eye."""
 
 
 def cloth(
@@ -57,7 +55,7 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
     layers = np.where(obstacles.hidden(balls, triangles.mean(axis=1), ax), 2, 4)
     if closed:
-        layers[_unit(_normals(triangles)) @ obstacles.towards_the_eye(ax) < AWAY] = 1
+        layers[looks_away(triangles, ax)] = 1
     groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
     groups += [(ball.corners, obstacles.shades(ball), 3) for ball in balls]
     drawn = [
@@ -70,24 +68,28 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     return drawn
 
 
+def looks_away(triangles: np.ndarray, ax: Any) -> np.ndarray:
+    """Which triangles `(n, 3, 3)` are seen from behind: their corners go round clockwise as the axes show them."""
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    x, y, _ = proj_transform(*triangles.reshape(-1, 3).T, ax.get_proj())
+    (xa, xb, xc), (ya, yb, yc) = (np.reshape(part, (-1, 3)).T for part in (x, y))
+    return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
+
+
 def brightness(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Lambert's law, seen from both sides: ambient light and the rest times |n·l|, for each face.
 
     n at a corner is the mean of the faces around it, by area, so that a coarse sheet looks as smooth as it is meant;
     where they turn sharply, as on the edge of a block, it is the face's own.
     """
-    normal = _normals(position[faces])
+    a, b, c = position[faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
     corners, weights = faces.ravel(), np.repeat(normal, 3, axis=0)
     around = np.stack([np.bincount(corners, weights[:, i], len(position)) for i in range(3)], axis=-1)
     own, mean = _unit(normal)[:, None], _unit(around)[faces]
     smooth = (own * mean).sum(axis=-1, keepdims=True) > SMOOTH
     return AMBIENT + (1 - AMBIENT) * np.abs(np.where(smooth, mean, own) @ LIGHT).mean(axis=1)
-
-
-def _normals(triangles: np.ndarray) -> np.ndarray:
-    """Twice the area of each triangle, along its normal."""
-    a, b, c = triangles.transpose(1, 0, 2)
-    return np.cross(b - a, c - a)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

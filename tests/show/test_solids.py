@@ -7,6 +7,7 @@ import pytest
 from physjax import Particles, Scene, animate, inertia, methods, plot, rigid, simulate
 from physjax.show import solids
 from physjax.show.solids import taken_bodies
+from physjax.show.surfaces import looks_away
 
 BRICK = inertia.box(1.0, (1.0, 2.0, 3.0))
 STILL = rigid.bodies(BRICK, position=[[0.0, 0, 0], [5, 0, 0]], orientation=[[1.0, 0, 0, 0], [1, 0, 0, 1]])
@@ -65,6 +66,8 @@ def test_the_far_side_of_a_body_is_drawn_before_its_near_one():
     far, near = (len(layers[order].get_facecolor()) for order in (1, 4))
     assert far + near == 12 + len(solids.sphere(1.0).faces)
     assert min(far, near) > 0.3 * (far + near)
+    top = np.array([[[0.0, 1, 0], [0, 1, 1], [1, 1, 0]]])  # seen from above
+    assert looks_away(np.concatenate([top, top[:, ::-1]]), ax).tolist() == [False, True]
 
 
 @pytest.mark.usefixtures("unannotated")
