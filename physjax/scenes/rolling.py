@@ -7,6 +7,7 @@ import numpy as np
 from physjax.physics import contacts, forces, inertia, rigid
 from physjax.scene import Scene
 from physjax.scenes.gallery import scene
+from physjax.show import solids
 from physjax.study import energy
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
@@ -35,6 +36,7 @@ def rolling(slope: float = 0.3, radius: float = 0.3, length: float = 0.8, g: flo
     return Problem(
         race,
         duration=duration,
+        looks=[solids.sphere(radius), solids.cylinder(radius, length)],
         conserved=(energy.ENERGY,),
         truths=(
             Truth("rolls down with a/(g sinθ) of 5/7 and 2/3 [1]", way, share, 1e-6),
@@ -61,6 +63,7 @@ def bowling(speed: float = 6.0, friction: float = 0.12, radius: float = 0.108, g
     return Problem(
         thrown,
         duration=2 * slides,
+        looks=solids.sphere(radius),
         truths=(
             Truth("rolls at (5/7) v₀ [relative]", lambda f: _velocity(f)[-1, 0] / speed, 5 / 7, 1e-6),
             Truth("turns as it rolls, ωr/v₀ [1]", lambda f: -_omega(f)[-1, 2] * radius / speed, 5 / 7, 1e-6),
@@ -97,6 +100,7 @@ def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
     return Problem(
         dropped,
         duration=4.0,
+        looks=solids.box(size),
         truths=(
             Truth("two come to rest on a face [m]", lying, 0.0, 1e-6),
             Truth("and do not move [m]", lambda f: f.position[-8:, :2] - f.position[-8, :2], 0.0, 1e-9),

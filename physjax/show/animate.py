@@ -69,7 +69,7 @@ def bodies(
     who = "animate.bodies"
     seen, faces = taken_bodies(who, film, shapes)
     frames, fps = schedule(who, seen, fps, speed)
-    return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color))
+    return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color, closed=True))
 
 
 def springs(

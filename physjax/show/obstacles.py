@@ -1,11 +1,12 @@
 """What is in the way, drawn lightly behind what moves: floors, walls, balls, rooms.
 
-In the plane any contact is drawn, by its gap; in space planes, slabs, spheres and rooms. Surfaces that differ from lane to
-lane are left out.
+In the plane any contact is drawn, by its gap; in space planes, slabs, spheres, rooms, and what has a `profile(low, high)`:
+a line `(n, 2)` of x and y [m] from one x to another, the same at every z. Surfaces that differ from lane to lane are left
+out.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.physics.contacts import Plane, Room, Slab, Sphere
+from physjax.physics.hulls import Touch
 from physjax.scene import Contact
 from physjax.show.stage import Stage
 
@@ -35,8 +37,9 @@ class Ball(NamedTuple):
 
 
 def shown(contacts: tuple) -> tuple[Contact, ...]:
-    """The contacts that are the same for all lanes."""
-    return tuple(contact for contact in contacts if _is_shared(contact))
+    """The surfaces that are the same for all lanes; of what bodies touch with a hull, the surface."""
+    surfaces = (contact.surface if isinstance(contact, Touch) else contact for contact in contacts)
+    return tuple(surface for surface in surfaces if _is_shared(surface))
 
 
 def with_obstacles(stage: Stage, contacts: tuple, times: Sequence[float] = (0.0,)) -> Stage:
@@ -164,7 +167,14 @@ def sheets_of(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
         return [_cut(stage, _center(contact, t) + side * half * normal, normal) for side in (-1, 1)]
     if isinstance(contact, Room):
         return _walls(contact, t)
-    return []
+    return _extruded(contact.profile, stage) if hasattr(contact, "profile") else []
+
+
+def _extruded(profile: Callable, stage: Stage) -> list[np.ndarray]:
+    """The strips between the points of a line in the plane of x and y, from side to side of the box."""
+    line = np.asarray(profile(stage.low[0], stage.high[0]), float)
+    near, far = (np.column_stack([line, np.full(len(line), side)]) for side in (stage.low[2], stage.high[2]))
+    return list(np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=1))
 
 
 def _walls(room: Room, t: float) -> list[np.ndarray]:

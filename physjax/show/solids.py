@@ -88,7 +88,7 @@ def bodies(
     who = "plot.bodies"
     seen, faces = taken_bodies(who, film, shapes)
     chosen = picked(who, seen, frames)
-    return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color), figure)
+    return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color, closed=True), figure)
 
 
 def taken_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray]:

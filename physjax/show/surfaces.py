@@ -14,8 +14,6 @@ from physjax.trajectory import Trajectory
 
 AMBIENT = 0.5
 """Brightness of a face that stands edge on to the light."""
-
-
 SMOOTH = 0.85
 """Cosine of the angle up to which faces are drawn as one smooth surface."""
 
@@ -48,8 +46,11 @@ def cloth(
     return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color), figure)
 
 
-def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any) -> list[Any]:
-    """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them."""
+def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any, closed: bool = False) -> list[Any]:
+    """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them.
+
+    Of what is `closed` the far side comes first: sorted by depth with the near one, some of it would show through.
+    """
     from matplotlib.colors import to_rgb
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -57,8 +58,10 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     faces = faces[scenery.stage.holds(position)[faces].all(axis=1)]
     triangles, colours = position[faces], brightness(position, faces)[:, None] * to_rgb(color)
     balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
-    behind = obstacles.hidden(balls, triangles.mean(axis=1), ax)
-    groups = [(triangles[behind], colours[behind], 2), (triangles[~behind], colours[~behind], 4)]
+    layers = np.where(obstacles.hidden(balls, triangles.mean(axis=1), ax), 2, 4)
+    if closed:
+        layers[looks_away(triangles, ax)] = 1
+    groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
     groups += [(ball.corners, obstacles.shades(ball), 3) for ball in balls]
     drawn = [
         Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
@@ -68,6 +71,15 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     for collection in drawn:
         ax.add_collection3d(collection)
     return drawn
+
+
+def looks_away(triangles: np.ndarray, ax: Any) -> np.ndarray:
+    """Which triangles `(n, 3, 3)` are seen from behind: their corners go round clockwise as the axes show them."""
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    x, y, _ = proj_transform(*triangles.reshape(-1, 3).T, ax.get_proj())
+    (xa, xb, xc), (ya, yb, yc) = (np.reshape(part, (-1, 3)).T for part in (x, y))
+    return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
 
 
 def brightness(position: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from physjax import Particles, Scene, animate, inertia, methods, plot, rigid, simulate
 from physjax.show import solids
 from physjax.show.solids import taken_bodies
+from physjax.show.surfaces import looks_away
 
 BRICK = inertia.box(1.0, (1.0, 2.0, 3.0))
 STILL = rigid.bodies(BRICK, position=[[0.0, 0, 0], [5, 0, 0]], orientation=[[1.0, 0, 0, 0], [1, 0, 0, 1]])
@@ -57,6 +58,16 @@ def test_pictures_and_films_are_drawn(tmp_path):
     assert (inside[..., 2].astype(int) - inside[..., 0] > 40).mean() > 0.01  # blue
     film = animate.bodies(FILM, shapes, fps=10)
     assert film.save(tmp_path / "boxes.gif", progress=False).stat().st_size > 1000
+
+
+def test_the_far_side_of_a_body_is_drawn_before_its_near_one():
+    (ax,) = plot.bodies(FILM, [solids.box((1.0, 2.0, 3.0)), solids.sphere(1.0)], frames=-1).axes
+    layers = {c.get_zorder(): c for c in ax.collections if c.get_zorder() in (1, 4)}
+    far, near = (len(layers[order].get_facecolor()) for order in (1, 4))
+    assert far + near == 12 + len(solids.sphere(1.0).faces)
+    assert min(far, near) > 0.3 * (far + near)
+    top = np.array([[[0.0, 1, 0], [0, 1, 1], [1, 1, 0]]])  # seen from above
+    assert looks_away(np.concatenate([top, top[:, ::-1]]), ax).tolist() == [False, True]
 
 
 @pytest.mark.usefixtures("unannotated")

@@ -6,7 +6,7 @@ import pytest
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from physjax import Particles, Scene, contacts, forces, lattices, methods, plot, simulate
+from physjax import Particles, Scene, contacts, forces, lattices, methods, plot, rigid, simulate
 from physjax.show import obstacles
 from physjax.show.obstacles import LIGHT
 from physjax.show.stage import Stage
@@ -192,6 +192,13 @@ def test_surfaces_that_move_are_drawn_where_they_are_and_those_that_differ_are_l
     assert obstacles.with_obstacles(CUBE, (bat,), (0.0, 0.75)).high[0] == 1.6
     ramp = contacts.Plane(np.zeros((4, 3)), (0, 1, 0))
     assert obstacles.shown((bat, ramp)) == (bat,)
+
+
+def test_of_what_bodies_touch_the_surface_is_drawn():
+    floor = contacts.Plane((0.0, 0.5, 0.0), (0.0, 1.0, 0.0))
+    shown = obstacles.shown((rigid.Touch(rigid.Hull.sphere(0.1), floor), rigid.Balls(0.1)))
+    assert shown[0] is floor
+    assert [len(obstacles.sheets_of(surface, CUBE, 0.0)) for surface in shown] == [1, 0]
 
 
 def test_what_is_behind_a_ball_is_known(drape):

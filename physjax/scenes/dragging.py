@@ -1,0 +1,116 @@
+"""A ragdoll, in metres: x the way it is dragged, y up, z to its right."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.checks import quantity
+from physjax.physics import contacts, forces, inertia, rigid
+from physjax.scene import Force, Particles, Scene
+from physjax.scenes.gallery import scene
+from physjax.show import solids
+from physjax.study.problem import Problem, Truth
+from physjax.vectors import over, scale
+
+LIMBS = {
+    # mass [kg], radius and length between the ends of its axis [m], where its middle lies along x and z [m]
+    "torso": (32.0, 0.13, 0.36, 0.0, 0.0),
+    "head": (5.0, 0.1, 0.06, 0.44, 0.0),
+    "arm": (2.2, 0.05, 0.2, 0.32, 0.2),
+    "forearm": (1.6, 0.045, 0.22, 0.62, 0.2),
+    "other arm": (2.2, 0.05, 0.2, 0.04, -0.2),
+    "other forearm": (1.6, 0.045, 0.22, -0.26, -0.2),
+    "thigh": (8.0, 0.075, 0.3, -0.5, 0.1),
+    "shin": (4.0, 0.055, 0.34, -0.92, 0.1),
+    "other thigh": (8.0, 0.075, 0.3, -0.5, -0.1),
+    "other shin": (4.0, 0.055, 0.34, -0.92, -0.1),
+}
+JOINED = (
+    # which two, and where along x and z [m]
+    ("torso", "head", 0.31, 0.0),
+    ("torso", "arm", 0.18, 0.2),
+    ("arm", "forearm", 0.47, 0.2),
+    ("torso", "other arm", 0.18, -0.2),
+    ("other arm", "other forearm", -0.1, -0.2),
+    ("torso", "thigh", -0.3, 0.1),
+    ("thigh", "shin", -0.7, 0.1),
+    ("torso", "other thigh", -0.3, -0.1),
+    ("other thigh", "other shin", -0.7, -0.1),
+)
+
+
+class Lead(Force):
+    """A damped spring to a place that sets out softly: F = k (X - x) + c (X' - v), X = X₀ + U (t - τ(1 - e^(-t/τ)))."""
+
+    couples: ClassVar[bool] = False
+    start: Float[Array, "..."] = quantity("place at t = 0", "m")
+    velocity: Float[Array, "..."] = quantity("velocity of the place in the end", "m/s")
+    soft: Float[Array, "..."] = quantity("time τ to set out in", "s", above=0)
+    stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", at_least=0)
+    damping: Float[Array, "..."] = quantity("damping c", "kg/s", at_least=0)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """The pull [N]."""
+        (x, v), begun = state, 1 - jnp.exp(-t / self.soft)
+        place = over(self.start, x) + scale(t - self.soft * begun, over(self.velocity, v))
+        slip = scale(begun, over(self.velocity, v)) - v
+        return scale(self.stiffness, place - x) + scale(self.damping, slip)
+
+
+@scene
+def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Problem:
+    """A ragdoll of ten limbs and nine ball joints, dragged over the ground by one hand.
+
+    Its joints are stiff springs, the hand's lead a soft one; the ends of its limbs slide.
+    """
+    names = list(LIMBS)
+    mass, radius, length, x, z = np.array(list(LIMBS.values())).T
+    height = radius.max()
+    middle = np.stack([x, np.full_like(x, height), z], axis=-1)
+    moments = [inertia.capsule(*limb, axis=0).principal for limb in zip(mass, radius, length, strict=True)]
+    limbs = inertia.Inertia(mass, jnp.stack(moments))
+    pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINED])
+    where = np.array([[x, height, z] for *_, x, z in JOINED])
+    joints = rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0)
+    led = np.array(names) == "forearm"
+    hand = np.array([length[led][0] / 2, 0.0, 0.0])
+    lead = Lead(middle[led][0] + hand, (speed, 0.0, 0.0), soft=0.3, stiffness=1e4 * led, damping=500.0 * led)
+    ends = np.multiply.outer(length, [[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    rough = contacts.Coulomb(friction, friction)
+    ground = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0, coulomb=rough)
+    dragged = Scene(
+        rigid.bodies(limbs, middle),
+        limbs,
+        (forces.Gravity(g), joints, rigid.AtPoint(hand, lead)),
+        (rigid.Touch(rigid.Hull(ends, radius), ground),),
+    )
+    duration, frames = 4.0, 64
+
+    def parted(flight):
+        return jax.vmap(joints.error)(jax.tree.map(jnp.asarray, flight.state))
+
+    def pace(flight):
+        place = mass @ flight.position[[frames // 2, -1], :, 0].T / mass.sum()
+        return np.diff(place)[0] / (speed * duration / 2)
+
+    def pull(flight):
+        state = jax.tree.map(jnp.asarray, flight.state)
+        force = jax.vmap(lambda t, state: rigid.AtPoint(hand, lead)(t, state, limbs).force)(flight.time, state)
+        along, up, _ = np.asarray(force)[frames // 2 :, led].mean(axis=(0, 1))
+        return along / (friction * (mass.sum() * g - up))
+
+    return Problem(
+        dragged,
+        duration=duration,
+        truths=(
+            Truth("at no frame has a joint parted by a millimetre [m]", parted, 0.0, 1e-3),
+            Truth("comes along as fast as the hand goes, on average [relative]", pace, 1.0, 0.02),
+            Truth("pulls with F_x/(μ(mg - F_y)) of 0.9 to 1: some of the slip is sideways [1]", pull, 0.95, 0.05),
+        ),
+        looks=[solids.capsule(*limb, axis=0) for limb in zip(radius, length, strict=True)],
+        frames=frames,
+    )

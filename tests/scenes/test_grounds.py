@@ -1,0 +1,60 @@
+"""The kerb and the hill of the gallery are surfaces: their gap grows at right angles to them, and they are drawn."""
+
+import jax
+import numpy as np
+import pytest
+
+from physjax.scenes.driving import Kerb
+from physjax.scenes.snow import Hill
+from physjax.show import obstacles
+from physjax.show.stage import Stage
+
+KERB = Kerb(13.0, 0.4)
+HILL = Hill(0.4, 1.5, 20.0, 3.0)
+
+
+def slope_of_the_gap(surface, place):
+    return jax.vmap(jax.grad(lambda x: surface.gap(0.0, x)))(place)
+
+
+@pytest.mark.parametrize(
+    ("place", "normal", "gap"),
+    [
+        ((5.0, 0.1, 3.0), (0.0, 1.0, 0.0), 0.1),  # above the ground
+        ((12.9, 0.3, 0.0), (-1.0, 0.0, 0.0), 0.1),  # before the face
+        ((15.0, 0.7, 0.0), (0.0, 1.0, 0.0), 0.3),  # above the top
+        ((12.7, 0.8, 0.0), (-0.6, 0.8, 0.0), 0.5),  # off the edge
+        ((13.1, 0.2, 0.0), (-1.0, 0.0, 0.0), -0.1),  # inside, nearest to the face
+        ((15.0, 0.3, 0.0), (0.0, 1.0, 0.0), -0.1),  # inside, nearest to the top
+    ],
+)
+def test_a_kerb_is_as_far_as_the_nearest_of_its_parts(place, normal, gap):
+    place = np.array([place])
+    np.testing.assert_allclose(KERB.gap(0.0, place), gap, atol=1e-12)
+    np.testing.assert_allclose(KERB.outward(0.0, place)[0], normal, atol=1e-12)
+    np.testing.assert_allclose(slope_of_the_gap(KERB, place)[0], normal, atol=1e-12)
+
+
+def test_on_a_hill_the_gap_grows_along_its_normal_and_bends_as_it_does():
+    x = np.linspace(10.0, 30.0, 101)
+    place = np.stack([x, np.asarray(HILL.height(x)[0])], axis=-1)
+    np.testing.assert_allclose(HILL.gap(0.0, place), 0.0, atol=1e-12)
+    np.testing.assert_allclose(slope_of_the_gap(HILL, place), HILL.outward(0.0, place), atol=1e-12)
+    slope = np.asarray(HILL.height(x)[1])
+    velocity = np.stack([np.full_like(x, 7.0), 7.0 * slope], axis=-1)
+
+    def gap(t, place, velocity):
+        return HILL.gap(t, place + t * velocity)
+
+    bend = jax.vmap(jax.grad(jax.grad(gap)), in_axes=(None, 0, 0))(0.0, place, velocity)
+    np.testing.assert_allclose(HILL.bend(0.0, place, velocity), bend, atol=1e-10)
+
+
+def test_a_profile_is_drawn_from_side_to_side():
+    stage = Stage(np.array([10.0, -1.0, -2.0]), np.array([16.0, 1.0, 2.0]))
+    ground, face, top = obstacles.sheets_of(KERB, stage, 0.0)
+    np.testing.assert_allclose(face[:, 0], 13.0)
+    np.testing.assert_allclose([np.ptp(ground[:, 2]), np.ptp(face[:, 1]), top[:, 1].min()], [4.0, 0.4, 0.4])
+    before = stage._replace(high=np.array([12.0, 1.0, 2.0]))
+    (ground,) = obstacles.sheets_of(KERB, before, 0.0)
+    assert np.ptp(ground[:, 1]) == 0.0
