@@ -8,6 +8,9 @@ from typing import Any
 
 from tqdm import tqdm
 
+BOUNCES = "bouncing_ball"
+"""The scene that shows what a contact does to the order of a method."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns 0, 1 if a part of it failed, or 2 with one plain line on standard error for bad input."""
@@ -15,7 +18,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     chart = commands.add_parser("chart", help="chart speed against accuracy for the scenes of the gallery")
-    chart.add_argument("scenes", nargs="*", metavar="SCENE", help="names from `physjax scenes`; all by default")
+    chart.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help="names from `physjax scenes`; by default all smooth ones and a ball that bounces",
+    )
     chart.add_argument(
         "--out", default="chart", metavar="DIR", help="where pictures, CSV and the page go (default: chart)"
     )
@@ -128,7 +136,7 @@ def _chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
     from physjax.scenes import SCENES
     from physjax.show import report
 
-    names = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(SCENES)
+    names = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or _smooth()
     folder = writable_folder(out)
     matplotlib.use("Agg")
     if whole:
@@ -139,6 +147,16 @@ def _chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
         file.write(report.page("physjax: speed against accuracy", summary, [section for _, section in results]))
     print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
     print(f"Measured on {report.machine()}.\nCharts: {folder / 'index.html'}")
+
+
+def _smooth() -> list[str]:
+    """What is charted unless told otherwise: motions without contacts or memory, and `BOUNCES` for what a contact does.
+
+    The others are charted when they are named; all of them together would take an hour.
+    """
+    from physjax.scenes import SCENES
+
+    return [name for name, build in SCENES.items() if name == BOUNCES or build().is_ode]
 
 
 def _reported(names: list[str], folder: Path) -> None:

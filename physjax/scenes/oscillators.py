@@ -1,4 +1,4 @@
-"""Things that swing."""
+"""Things that swing, circle and bob."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -87,6 +87,83 @@ def oscillator_chain(count: int = 50, stiffness: float = 40.0, mass: float = 0.1
                 1.0,
                 1e-6,
             ),
+        ),
+        frames=128,
+    )
+
+
+@scene
+def conical_pendulum(
+    length: float = 1.0, angle: float = 0.6, mass: float = 0.5, stiffness: float = 2e3, g: float = 9.8
+) -> Problem:
+    """A mass on a string that goes round a level circle: ω² = g/(L cosθ), the string's pull is mg/cosθ, inward mω²r."""
+    radius, omega = length * np.sin(angle), np.sqrt(g / (length * np.cos(angle)))
+    pull = mass * g / np.cos(angle)
+    string = Springs([[0, 1]], stiffness=stiffness, rest_length=length - pull / stiffness)
+    start = jnp.asarray([[0.0, 0.0, 0.0], [radius, -length * np.cos(angle), 0.0]])
+    circling = Scene(
+        Particles(start, jnp.asarray([[0.0, 0.0, 0.0], [0.0, 0.0, radius * omega]])),
+        mass=mass,
+        forces=(forces.Gravity(g), string),
+        pinned=np.array([True, False]),
+    )
+
+    def exact(t):
+        x, v = (np.zeros((len(t), 2, 3)) for _ in range(2))
+        x[:, 1] = np.stack([radius * np.cos(omega * t), np.full(len(t), start[1, 1]), radius * np.sin(omega * t)], -1)
+        v[:, 1, 0], v[:, 1, 2] = -omega * x[:, 1, 2], omega * x[:, 1, 0]
+        return Particles(x, v)
+
+    def leaning(flight):
+        return np.arctan2(np.linalg.norm(flight.position[:, 1, ::2], axis=-1), -flight.position[:, 1, 1])
+
+    def tension(flight):
+        return stiffness * (np.linalg.norm(flight.position[:, 1], axis=-1) - float(string.rest_length))
+
+    return Problem(
+        circling,
+        duration=float(4 * np.pi / omega),
+        exact=exact,
+        conserved=(ENERGY,),
+        truths=(
+            Truth("leans as tanθ = ω²r/g says [rad]", leaning, np.arctan2(omega**2 * radius, g), 1e-8),
+            Truth("the string pulls with mg/cosθ [N]", tension, pull, 1e-5),
+            Truth(
+                "of which mω²r is inward [N]", lambda f: tension(f) * np.sin(leaning(f)), mass * omega**2 * radius, 1e-5
+            ),
+        ),
+    )
+
+
+@scene
+def floating_ball(radius: float = 0.1, density: float = 400.0, drop: float = 0.3, g: float = 9.8) -> Problem:
+    """A light ball dropped into water: it dives, bobs, and floats where the water it displaces weighs what it does."""
+    water, mass = 1000.0, density * 4 / 3 * np.pi * radius**3
+    dropped = Scene(
+        Particles(jnp.asarray([drop]), jnp.zeros(1)),
+        mass=mass,
+        forces=(
+            forces.Gravity(g, up=0),
+            forces.Buoyancy(density=water, radius=radius, surface=0.0, g=g, up=0),
+            forces.StokesDrag(3.0 * mass),
+        ),
+    )
+    # πh²(3r - h)/3 = V ρ/ρ_water, between dry and drowned
+    depths = np.roots([-np.pi / 3, np.pi * radius, 0.0, -mass / water])
+    depth = float(next(h.real for h in depths if abs(h.imag) < 1e-12 and 0 < h.real < 2 * radius))
+
+    def weight_displaced(flight):
+        shown = Particles(flight.position[-1], flight.velocity[-1])
+        return water * float(dropped.forces[1].displaced(shown))
+
+    return Problem(
+        dropped,
+        duration=15.0,
+        truths=(
+            Truth("floats as deep as Archimedes says [m]", lambda f: radius - f.position[-1, 0], depth, 1e-8),
+            Truth("displaces its own mass of water [kg]", weight_displaced, mass, 1e-6),
+            Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-8),
+            Truth("its middle dived under water on the way [m]", lambda f: f.position.min(), -0.15, 0.15),
         ),
         frames=128,
     )
