@@ -75,6 +75,7 @@ def test_births_are_the_same_at_every_step_size():
     assert np.abs(runs[0].dies - runs[1].dies).max() <= 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pool", [900, 3000])
 def test_a_run_resumed_at_any_frame_has_the_same_bits(precision, pool):
     floor = FLOOR if pool < FEWEST else LECTURE
@@ -189,6 +190,7 @@ def test_the_newly_born_forget_what_their_slot_lay_on():
     assert np.abs(flight.velocity[-1][old]).max() == 0
 
 
+@pytest.mark.slow
 def test_a_landing_moves_with_speed_and_cone():
     """Gradients of the mean square distance of the landing points against central differences."""
 

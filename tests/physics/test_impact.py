@@ -358,6 +358,7 @@ def test_alone_in_lanes_in_a_large_batch_and_under_vmap_agree():
     np.testing.assert_allclose(run(heights[600]), lanes[600], rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_run_with_resting_lanes_is_resumed_and_loaded(tmp_path):
     scene = dropped(np.linspace(0.05, 1.0, 5), (1.0, 0.0), restitution=0.5, coulomb=contacts.Coulomb(0.4, 0.3))
     whole = simulate(scene, methods.rk4, dt=0.01, steps=200)

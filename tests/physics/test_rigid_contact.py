@@ -55,6 +55,7 @@ def test_no_impulses_at_any_points_add_energy():
     assert (jnp.max(push, axis=0) > 0).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_a_thousand_random_drops_never_gain_energy():
     rng = np.random.default_rng(1)
     n = 1000
@@ -74,6 +75,7 @@ def test_a_thousand_random_drops_never_gain_energy():
     assert gap.min() > -1e-5
 
 
+@pytest.mark.slow
 def test_a_smooth_box_keeps_its_energy_over_a_hundred_impacts():
     scene = dropped(floor(1.0), height=0.25, angular_velocity=(1.0, 2.0, 3.0))
     film = simulate(scene, methods.rk4, dt=1e-3, steps=16_000)
@@ -92,6 +94,7 @@ def test_a_box_dropped_tilted_comes_to_rest_on_a_face_and_then_does_not_move():
     assert np.abs(turns - turns[0]).max() <= 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.99, 1.2])
 def test_friction_holds_a_box_on_a_slope_up_to_its_angle_and_not_beyond(share):
     mu = 0.3
@@ -121,6 +124,7 @@ def test_a_belt_takes_a_ball_along():
 # derivatives
 
 
+@pytest.mark.slow
 def test_gradients_through_an_impact_agree_with_differences():
     @jax.jit
     def outcome(numbers):

@@ -51,6 +51,7 @@ def test_a_scene_is_told_with_its_size_and_its_truths():
     assert max(map(len, str(told).splitlines())) <= 110
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("gallery")
 def test_every_scene_is_drawn_and_one_that_fails_is_named_at_the_end(tmp_path, capsys):
     folder = tmp_path / "gallery"

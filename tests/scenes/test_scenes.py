@@ -8,10 +8,13 @@ from physjax import methods, simulate
 from physjax.scenes import SCENES, title
 from physjax.scenes.gallery import table
 
+SLOW = ("car", "ragdoll")
+"""What compiles for many seconds."""
 
-@pytest.fixture(params=SCENES.values(), ids=SCENES)
+
+@pytest.fixture(params=[pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in SCENES])
 def problem(request):
-    return request.param()
+    return SCENES[request.param]()
 
 
 def test_every_truth_holds(problem):

@@ -98,12 +98,14 @@ def test_a_converged_cloth_solves_the_whole_equation():
     np.testing.assert_allclose(v1, wanted, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_converged_rope_is_the_solution_of_dense_newton():
     scene = crumpled(rope(10, damping=0.1), 0.02)
     after = jax.jit(CONVERGED)(scene, 0.0, scene.state, DT)
     np.testing.assert_allclose(after.velocity, dense_newton(scene, DT), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["rope", "drag"])
 def test_converged_steps_equal_those_of_diffrax(case):
     air = forces.QuadraticDrag(area=0.01, coefficient=1.0, wind=jnp.asarray([2.0, 0.0, 1.0]))
@@ -286,6 +288,7 @@ def test_the_gradient_through_a_cloth_agrees_with_central_differences():
     demand_derivatives(crumpled(hung(24), 2e-3), ImplicitEuler(tolerance=1e-13), [jax.grad])
 
 
+@pytest.mark.slow
 def test_derivatives_through_converged_steps_agree_with_central_differences_in_both_modes():
     rope_in_air = crumpled(rope(8, damping=0.02), 2e-3)
     demand_derivatives(rope_in_air, ImplicitEuler(tolerance=1e-12, newton=20), [jax.grad, jax.jacfwd])

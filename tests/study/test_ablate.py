@@ -48,6 +48,7 @@ def test_which_law_of_drag_a_raindrop_needs_at_which_size():
     assert (told["SphereDrag"].verdicts == NEEDED).all()
 
 
+@pytest.mark.slow
 def test_which_planets_matter_to_the_earth_to_one_kilometre_over_a_year():
     scene = SCENES["solar_system"]().scene
     names = table("solar_system_de421.csv")["body"][: scene.state.lanes[0]].tolist()
@@ -153,6 +154,7 @@ def test_a_verdict_weighs_the_change_against_what_counts_and_what_is_numerical()
     assert _verdicts(change, numerical, matters, True).tolist() == [NONE, COSTLY, NEEDED, NEEDED]
 
 
+@pytest.mark.slow
 def test_times_are_taken_side_by_side_and_what_costs_is_told():
     many = Particles(jnp.zeros((4000, 3)), jnp.ones((4000, 3)))
     # many terms that act on nothing, which take their time all the same
@@ -168,6 +170,7 @@ def test_times_are_taken_side_by_side_and_what_costs_is_told():
     assert len(told.plot().axes) == 2
 
 
+@pytest.mark.slow
 def test_what_may_be_left_out_alone_and_two_at_once():
     floor = contacts.Plane((0.0, 0.0), (0.0, 1.0))
     scene = Scene(Particles(jnp.zeros(2), jnp.ones(2)), 1.0, (forces.Gravity(), forces.StokesDrag(0.1)), (floor,))

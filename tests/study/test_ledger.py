@@ -53,6 +53,7 @@ def test_the_methods_own_share_falls_with_its_order(method):
     assert slope == pytest.approx(method.promises.order, abs=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("response", [contacts.impact, contacts.project])
 def test_a_bounce_costs_one_minus_the_square_of_the_restitution(response):
     floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.8, friction=0.3, response=response)
@@ -89,6 +90,7 @@ def test_bounces_slides_and_walls_each_have_their_entry():
     assert taken["Plane 2"][0] == taken["Plane 2"][1] == 0.0
 
 
+@pytest.mark.slow
 def test_a_damped_net_that_is_led_and_breaks():
     sheet = lattices.cloth(
         width=0.6, height=0.6, rows=4, columns=4, mass=0.1, structural=60.0, shear=20.0, bend=2.0, damping=0.05
@@ -116,6 +118,7 @@ def test_a_damped_net_that_is_led_and_breaks():
     np.testing.assert_allclose(books.momentum.totals["Springs"], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_kick_and_a_turning_body_on_a_pivot():
     brick = inertia.box(2.0, (0.4, 0.2, 0.6)).about((0.0, 0.5, 0.0))
     hung = rigid.bodies(brick, (0.0, -0.5, 0.0), angular_velocity=(2.0, 1.0, 0.5))

@@ -56,6 +56,7 @@ def test_the_answer_prints_as_a_table_with_reason_and_evidence(swings):
     assert swings[1].richardson == pytest.approx(swings[1].best.error, rel=0.5)
 
 
+@pytest.mark.slow
 def test_a_random_scene_keeps_its_promise_against_another_reference():
     """Diffrax in the search, our own rk4 with fine steps here."""
     scene, horizon = random_scene(2)
@@ -77,6 +78,7 @@ def ball(response):
     return Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(forces.Gravity(up=0),), contacts=(floor,))
 
 
+@pytest.mark.slow
 def test_through_contacts_the_truth_is_our_own_and_the_answer_says_so():
     advice = recommend(ball(contacts.impact), error=1e-6, horizon=1.0, methods=[methods.rk4], progress=False)
     assert advice.ok
@@ -84,6 +86,7 @@ def test_through_contacts_the_truth_is_our_own_and_the_answer_says_so():
     assert "Richardson" in advice.evidence
 
 
+@pytest.mark.slow
 def test_touches_answered_late_are_what_stops_a_small_error():
     advice = recommend(
         ball(contacts.project), error=1e-9, horizon=1.0, methods=[methods.verlet], seconds=3, progress=False
@@ -94,6 +97,7 @@ def test_touches_answered_late_are_what_stops_a_small_error():
         advice.simulate()
 
 
+@pytest.mark.slow
 def test_chaos_is_named_with_its_horizon():
     """Three bodies at rest on a triangle of sides 3, 4 and 5 (Burrau's problem), softened: they scatter each other."""
     place = jnp.asarray([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]])
@@ -112,6 +116,7 @@ def test_float32_is_named_where_it_stops():
     assert recommend(spring(), error=1e-10, **few).best.dtype == "float64"
 
 
+@pytest.mark.slow
 def test_a_gradient_must_keep_the_error_as_well():
     advice = recommend(spring(), error=1e-5, horizon=10.0, methods=FEW, gradient=True, progress=False)
     assert "gradient" in advice.norm
@@ -182,6 +187,7 @@ def test_bad_input_is_refused_in_plain_words(arguments, message):
         recommend(given.pop("scene"), **given)
 
 
+@pytest.mark.slow
 def test_rigid_bodies_are_advised_as_well():
     problem = SCENES["free_top"]()
     advice = recommend(

@@ -36,6 +36,7 @@ def small(monkeypatch):
     monkeypatch.setattr("physjax.study.problem.FILM", 32)
 
 
+@pytest.mark.slow
 def test_a_report_is_one_page_with_every_part_and_its_pictures_inside(tmp_path, capsys, monkeypatch):
     small(monkeypatch)
     assert main(["chart", "oscillator", "--report", "--out", str(tmp_path)]) == 0

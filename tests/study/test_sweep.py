@@ -181,6 +181,7 @@ def test_one_per_cent_of_bad_lanes_leave_the_others_bit_equal(measure):
     clean_and_with_bad_lanes(measure, 1000, (np.nan, np.inf))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", [fixed_steps, chosen_steps])
 def test_lanes_that_blow_up_on_the_way_leave_the_others_bit_equal(measure):
     clean_and_with_bad_lanes(measure, 1000, (1e200,))

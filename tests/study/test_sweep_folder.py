@@ -61,6 +61,7 @@ def files(folder):
     return {(p.name, p.stat().st_ino, p.stat().st_mtime_ns) for p in folder.glob("chunk-*.npz")}
 
 
+@pytest.mark.slow
 def test_killed_at_ten_random_moments_and_resumed_it_is_bit_equal_and_nothing_is_computed_twice(
     tmp_path, uninterrupted
 ):
