@@ -12,6 +12,7 @@ from physjax.particles import Particles, demand_particles
 from physjax.scene import Scene
 from physjax.show.report import seconds_text
 from physjax.stepping.adaptive import Adaptive
+from physjax.stepping.implicit import ImplicitEuler
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
 from physjax.study.lane_parts import one_lane
@@ -21,6 +22,8 @@ from physjax.trajectory import Trajectory
 
 MOMENTS = 12
 """Moments of a run at which its rates are looked at."""
+SOLVE = 20
+"""Evaluations that a linear solve is worth, when methods are compared: conjugate gradients take some dozens of products."""
 RESOLVED = 0.5
 """|λ| dt beyond which the fastest motion is stable at best, but not followed."""
 
@@ -196,10 +199,11 @@ def _cures(scene: Scene, method: Any, dt: float, worst: Limit, state: Particles)
     for name, other in METHODS.items():
         longest = min(0.9 * limit(scene, other, at=state).dt, dt) if other is not method else 0.0
         if longest > 0:
-            others.append((other.promises.evaluations / longest, longest, name))
-    for cost, longest, name in sorted(others)[: 2 - len(cures)]:
+            solves = isinstance(other, ImplicitEuler)
+            others.append(((SOLVE if solves else other.promises.evaluations) / longest, longest, name, solves))
+    for cost, longest, name, solves in sorted(others)[: 2 - len(cures)]:
         times = f", {cost * dt / promised.evaluations:.3g} times the cost" if promised else ""
-        cures.append(f"{name} with dt = {seconds_text(longest)}{times}")
+        cures.append(f"{name} with dt = {seconds_text(longest)}{', a linear solve a step' if solves else times}")
     return tuple(cures)
 
 

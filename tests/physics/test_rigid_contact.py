@@ -85,6 +85,7 @@ def test_a_smooth_box_keeps_its_energy_over_a_hundred_impacts():
     assert np.abs(e / e[0] - 1).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_box_dropped_tilted_comes_to_rest_on_a_face_and_then_does_not_move():
     scene = dropped(floor(0.0, 0.5))
     film = simulate(scene, methods.rk4, dt=1e-3, steps=104_000, save_every=4000)

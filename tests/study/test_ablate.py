@@ -100,6 +100,7 @@ def test_bend_springs_in_a_taut_rope_pull_it_straight_as_the_dispersion_says():
     assert found.verdict == NEEDED
 
 
+@pytest.mark.slow
 def test_the_third_dimension_goes_where_nothing_needs_it():
     ball = Particles(jnp.asarray([0.0, 1.0, 0.5]), jnp.asarray([3.0, 4.0, 0.0]))
     spin = forces.Magnus(4.3e-3, 3.0, (0.0, 0.0, 3.0))

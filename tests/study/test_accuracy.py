@@ -192,7 +192,8 @@ def test_what_is_projected_already_has_one_treatment():
     ball = Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(forces.Gravity(up=0),), contacts=(floor,))
     study = work_precision(ball, [methods.verlet], [1e-3], duration=1.0, budget=FEW)
     assert study.promised == {"verlet": 1}
-    assert study.floor > 1e-6, "the reference is first order too, and says so"
+    # finer steps than the run's by far, but not the 1e-13 of a reference that keeps its order
+    assert study.floor > 1e-9, "the reference is first order too, and says so"
 
 
 @pytest.fixture(scope="module")
