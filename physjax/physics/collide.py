@@ -61,9 +61,12 @@ def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scen
     arrived = jnp.zeros(dt.shape, bool) if scene.held is None else scene.held
     leg = _Leg(jnp.zeros_like(dt), scene.state, arrived)
 
+    @jax.checkpoint  # reverse mode takes each leg again: what it would remember of one is more than the work
+    def further(leg):
+        return chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
+
     def go_on(leg, _):
-        more = any_lane(~leg.arrived)
-        return lax.cond(more, lambda: chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt)), lambda: leg), None
+        return lax.cond(any_lane(~leg.arrived), further, lambda leg: leg, leg), None
 
     leg, _ = lax.scan(go_on, leg, length=IMPACTS + 1)
     return scene.having(state=leg.state)

@@ -6,6 +6,7 @@ for the points k of a body, r from its centre of mass, b the velocities before (
 Gauss-Seidel, one point after the other, all lanes at once. Arrays of points are `(points, *lanes, ...)`.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -14,13 +15,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from physjax.lanes import any_lane
+from physjax.lanes import any_lane, loop
 from physjax.physics.bodies import RigidBodies, answer
 from physjax.physics.inertia import Inertia
 from physjax.vectors import cross, dot, norm
 
-SWEEPS = 16
-"""The square of this is the most passes over all points. A point alone needs two, a box on its face about twenty, at the
+SWEEPS = 256
+"""The most passes over all points. A point alone needs two, a box on its face about twenty, at the
 edge of what friction can hold a hundred."""
 
 
@@ -37,7 +38,7 @@ class _Rows(NamedTuple):
     """Each point's own answer K = W_kk: what the sweeps need of it. Vectors are `(points, 3, *lanes)`, without friction None.
 
     `share` is 1/(n·Kn) of points that take part, else 0; `back` K⁻¹, `aside` Kn, `lean` K⁻¹n/(n·K⁻¹n), `brake` one over
-    the stiffest way across the normal.
+    the stiffest way across the normal. With `push` the normal impulses are given, and only friction is looked for.
     """
 
     arm: Array
@@ -49,6 +50,7 @@ class _Rows(NamedTuple):
     lean: Array | None = None
     brake: Array | None = None
     friction: tuple[Array, Array] | None = None
+    push: Array | None = None
 
 
 def impulses(
@@ -73,9 +75,8 @@ def impulses(
         points = points._replace(friction=(points.friction[1],) * 2)
     body = _body(bodies, inertia)
     rows = _rows(points, active, body)
-    still = jnp.zeros((6, *bodies.lanes), bodies.dtype)
-    j, moved = _swept(rows, body, jnp.zeros_like(rows.before), still, fixed=False)
-    felt = _speed(rows, moved[None])
+    j = _settled(rows, body, jnp.zeros_like(rows.before))
+    felt = _speed(rows, _given(rows, body, j)[None])
     work, square = (jnp.sum(part * j, axis=(0, 1)) for part in (rows.before, felt))
     wanted = jnp.ones_like(work)
     if restitution is not None:
@@ -83,9 +84,9 @@ def impulses(
         total = jnp.sum(push, axis=0)
         wanted = 1 + jnp.sum(restitution * push, axis=0) / jnp.where(total > 0, total, 1.0)
     share = jnp.minimum(wanted, jnp.where(square > 0, -2.0 * work / jnp.where(square > 0, square, 1.0), 0.0))
-    j, moved = share[None, None] * j, share[None] * moved
+    j = share[None, None] * j
     if restitution is not None and points.friction is not None:
-        j, _ = _swept(rows, body, j, moved, fixed=True)
+        j = _settled(rows._replace(push=_along(rows.normal, j)), body, j)
     push = jnp.moveaxis(j, 1, -1)
     given = jnp.sum(push, axis=0), jnp.sum(cross(points.arm, push), axis=0)
     momenta = bodies.momentum + given[0], bodies.angular_momentum + given[1]
@@ -133,42 +134,63 @@ def _rows(points: Points, active: Array, body: _Body) -> _Rows:
     )
 
 
-def _swept(rows: _Rows, body: _Body, j: Array, moved: Array, *, fixed: bool) -> tuple[Array, Array]:
-    """Impulses `(points, 3, *lanes)` and the velocity and ω that they give, `(6, *lanes)`, swept until nothing changes.
+def _settled(rows: _Rows, body: _Body, start: Array) -> Array:
+    """Impulses `(points, 3, *lanes)` that a sweep over the points leaves as they are.
 
-    With `fixed` the normal impulses stay, and only friction is looked for.
+    They move with the rows as a fixed point does: a linear problem, swept alike, so that no derivative follows the sweeps.
     """
-    small = 256 * float(jnp.finfo(j.dtype).eps)
 
-    def sweep(carry):
-        j, moved, _ = carry
-        moved, after = lax.scan(partial(_turn, body, fixed), moved, (rows, j))
-        change, size = (jnp.sum(jnp.abs(part), axis=(0, 1)) for part in (after - j, after))
-        return after, moved, change > small * size
+    def left(j):
+        return _sweep(rows, body, j)[0] - j
 
-    def again(step, times):
-        return lambda carry: lax.scan(
-            lambda carry, _: (lax.cond(any_lane(carry[-1]), step, lambda carry: carry, carry), None),
-            carry,
-            length=times,
-        )[0]
+    def swept(_, j):
+        moved = _given(rows, body, j)
 
-    # nested, so that few questions are asked once nothing changes any more
-    start = j, moved, jnp.any(rows.share > 0, axis=0)
-    j, moved, _ = again(again(sweep, SWEEPS), SWEEPS)(start)
-    return j, moved
+        def pass_(carry):
+            after, moved = _sweep(rows, body, carry[0], carry[1])
+            return after, moved, _changes(carry[0], after)
+
+        return _repeated(pass_, (j, moved, jnp.any(rows.share > 0, axis=0)))[0]
+
+    def answered(change, right):
+        def pass_(carry):
+            after = carry[0] + change(carry[0]) - right
+            return after, _changes(carry[0], after)
+
+        return _repeated(pass_, (jnp.zeros_like(right), jnp.any(right != 0, axis=(0, 1))))[0]
+
+    solve = partial(lax.custom_linear_solve, solve=answered, transpose_solve=answered)
+    return lax.custom_root(left, start, swept, solve)
 
 
-def _turn(body: _Body, fixed: bool, moved: Array, point: tuple[_Rows, Array]) -> tuple[Array, Array]:
+def _sweep(rows: _Rows, body: _Body, j: Array, moved: Array | None = None) -> tuple[Array, Array]:
+    """The impulses after every point had its turn, and the velocity and ω `(6, *lanes)` that they give."""
+    moved = _given(rows, body, j) if moved is None else moved
+    moved, after = lax.scan(partial(_turn, body), moved, (rows, j))
+    return after, moved
+
+
+def _changes(before: Array, after: Array) -> Array:
+    """Which lanes a pass changes by more than rounding."""
+    change, size = (jnp.sum(jnp.abs(part), axis=(0, 1)) for part in (after - before, after))
+    return change > 256 * float(jnp.finfo(after.dtype).eps) * size
+
+
+def _repeated(pass_: Callable, start: tuple) -> tuple:
+    """Passes until the last part of what they carry, the lanes that they change, is empty."""
+    return loop(lambda carry: any_lane(carry[-1]), pass_, start, most=SWEEPS)
+
+
+def _turn(body: _Body, moved: Array, point: tuple[_Rows, Array]) -> tuple[Array, Array]:
     """One point's turn, given what the others do: it sticks if it can, else it is pushed and slips."""
     row, old = jax.tree.map(lambda part: part[None], point)
     v, pushed = row.before + _speed(row, moved[None]), _along(row.normal, old)
-    push = pushed if fixed else jnp.maximum(pushed - _along(row.normal, v) * row.share, 0.0)
+    push = jnp.maximum(pushed - _along(row.normal, v) * row.share, 0.0) if row.push is None else row.push
     new = push[:, None] * row.normal
     if row.friction is not None:
         static, kinetic = row.friction
         stick = old - _times(row.back, v)
-        if fixed:
+        if row.push is not None:
             stick, static = stick + (push - _along(row.normal, stick))[:, None] * row.lean, kinetic
         v = v + (push - pushed)[:, None] * row.aside
         slip = _across(row.normal, old - row.brake[:, None] * v)
@@ -177,9 +199,17 @@ def _turn(body: _Body, fixed: bool, moved: Array, point: tuple[_Rows, Array]) ->
         held = _along(row.normal, stick)
         sticks = (held >= 0) & (_size(_across(row.normal, stick)) <= static * held)
         new = jnp.where((row.share > 0)[:, None], jnp.where(sticks[:, None], stick, new + slip), 0.0)
-    change = new - old
-    given = jnp.concatenate([body.lightness * change, _times(body.turns, _cross(row.arm, change))], axis=1)
-    return moved + given[0], new[0]
+    return moved + _gives(row, body, new - old)[0], new[0]
+
+
+def _given(rows: _Rows, body: _Body, j: Array) -> Array:
+    """The velocity and ω `(6, *lanes)` that all the impulses give to their body."""
+    return jnp.sum(_gives(rows, body, j), axis=0)
+
+
+def _gives(rows: _Rows, body: _Body, j: Array) -> Array:
+    """The velocity and ω `(points, 6, *lanes)` that each impulse gives."""
+    return jnp.concatenate([body.lightness * j, _times(body.turns, _cross(rows.arm, j))], axis=1)
 
 
 def _speed(rows: _Rows, moved: Array) -> Array:
