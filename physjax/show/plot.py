@@ -41,6 +41,8 @@ PROJECTED = ", projected"
 """What is added to a method's name where its touches are answered at the end of the step."""
 FLOAT32 = ", float32"
 """What is added where it ran in float32."""
+BAND = {"color": "#F0E442", "linewidth": 9, "alpha": 0.5, "solid_capstyle": "round"}
+"""Pareto's front."""
 ADAPTIVE = "adaptive "
 """What stands before the name of a method that is subdivided."""
 MOST_LANES = 200
@@ -232,9 +234,7 @@ def work_precision(result: Any, figure: Any = None) -> Any:
 def _band(ax: Any, front: Any) -> None:
     """Pareto's front, behind the lines."""
     across, up = [run.seconds for run in front], [max(run.path_error, 1e-17) for run in front]
-    ax.plot(across, up, color="#F0E442", linewidth=9, alpha=0.5, zorder=0, solid_capstyle="round")
-    if front:
-        ax.annotate("Pareto's front", (across[0], up[0]), xytext=(8, 4), textcoords="offset points", fontsize=8)
+    ax.plot(across, up, **BAND, zorder=0)
 
 
 def _mark_horizon(ax: Any, time: np.ndarray, position: np.ndarray, horizon: float) -> None:
@@ -273,6 +273,7 @@ def _below(figure: Any, result: Any) -> float:
     handles = [plt.Line2D([], [], **style(method), label=_legend(result, method)) for method in methods]
     failed = plt.Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
     handles.insert(len(methods) // 2 if projected else len(methods), failed)
+    handles.append(plt.Line2D([], [], **BAND, label="Pareto's front"))
     columns = 2 if projected else 3
     what = (
         "solid: impacts found inside the step; dashed, hollow: projected at the end of the step" if projected else None

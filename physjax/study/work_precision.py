@@ -124,15 +124,8 @@ class WorkPrecision(NamedTuple):
         return tuple(front)
 
     def table(self) -> str:
-        """A line for each method: order promised and observed, its cheapest run for each of `ERRORS`, and where it failed."""
-        headers = [
-            "method",
-            "order",
-            "observed",
-            *(f"error {e:.0e}" for e in ERRORS),
-            "fails from dt [s]",
-            "compile [s]",
-        ]
+        """A line for each method: order promised and seen, its least time to each of `ERRORS`, and where it failed."""
+        headers = ["method", "order", "seen", *(f"to {e:.0e}" for e in ERRORS), "fails at dt", "compile"]
         rows = []
         for method in self.methods:
             runs = self.of(method)
@@ -144,8 +137,8 @@ class WorkPrecision(NamedTuple):
                     _number(self.promised.get(method), ".0f"),
                     _order(self.observed_order(method)) if method in self.promised else "-",
                     *(seconds_text(run.seconds) if run else "-" for run in cheapest),
-                    f"{min(failed):.3g}" if failed else "-",
-                    f"{runs[0].compile_seconds:.2f}",
+                    seconds_text(min(failed)) if failed else "-",
+                    seconds_text(runs[0].compile_seconds),
                 ]
             )
         return table(headers, rows)
