@@ -15,6 +15,7 @@ from physjax.files import replacing, replacing_folder
 from physjax.show.films import schedule
 from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document
 from physjax.show.pages import demanded
+from physjax.show.report import progress_bar
 from physjax.show.subjects import Bodies, Dots, Lines, Surface, subject
 from physjax.show.takes import Take, batch_index, unbroken
 from physjax.trajectory import Trajectory
@@ -207,6 +208,4 @@ def _rgb(color: Any) -> tuple[float, float, float]:
 
 
 def _counted(items: Any, progress: bool) -> Any:
-    from tqdm import tqdm
-
-    return tqdm(items, desc="writing", unit="frame", disable=not progress, leave=False)
+    return progress_bar(items, progress=progress, desc="writing", unit="frame", leave=False)

@@ -15,6 +15,7 @@ from physjax.files import replacing
 from physjax.show import obstacles
 from physjax.show.pages import demanded, filled, framed, write_page
 from physjax.show.panels import Scenery, arranged
+from physjax.show.report import progress_bar
 from physjax.show.takes import Take
 
 LONGEST = 600.0
@@ -198,6 +199,4 @@ def _palette(pictures: list[Any]) -> Any:
 
 
 def _counted(frames: Sequence[int], progress: bool) -> Iterator[int]:
-    from tqdm import tqdm
-
-    return iter(tqdm(frames, desc="drawing", unit="picture", disable=not progress, leave=False))
+    return iter(progress_bar(frames, progress=progress, desc="drawing", unit="picture", leave=False))

@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import platform
+import sys
 from collections.abc import Sequence
 from datetime import date
 from importlib.metadata import version
@@ -26,6 +27,14 @@ def table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str |
         ).rstrip()
 
     return "\n".join([line(headers), "  ".join("-" * width for width in widths), *map(line, rows)])
+
+
+def progress_bar(items: Any = None, *, progress: bool = True, **options: Any) -> Any:
+    """A bar of tqdm around what is done one after the other, on standard error; not in notebooks, which show that in red."""
+    from tqdm import tqdm
+
+    stream = sys.stdout if "ipykernel" in sys.modules else sys.stderr
+    return tqdm(items, file=stream, disable=not progress, **options)
 
 
 def seconds_text(seconds: int | float) -> str:

@@ -4,7 +4,6 @@ A few runs of each method from coarse to fine show its error and its cost; betwe
 that is asked for, which is then verified by a run. Only what can still win is verified, and only that is timed well.
 """
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ import numpy as np
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.scene import Scene
-from physjax.show.report import seconds_text, table
+from physjax.show.report import progress_bar, seconds_text, table
 from physjax.stepping.methods import METHODS, adaptive, rk4
 from physjax.stepping.reference import in_dtype
 from physjax.stepping.simulate import simulate
@@ -164,18 +163,18 @@ def recommend(
     problem, errors = _asked(scene, error, horizon, frames)
     norm, dtypes = as_norm(norm), [np.dtype(dtype).name for dtype in dtypes]
     deadline = time.process_time() + float(real_quantity("seconds [s]", seconds, above=0.0))
-    with jax.enable_x64(True), _bar(progress) as bar:
-        bar.set_postfix_str("the true path")
+    with jax.enable_x64(True), progress_bar(progress=progress, desc="recommend", unit="method", leave=False) as shown:
+        shown.set_postfix_str("the true path")
         push = random_push(scene) if gradient else None
         truth = yardstick(problem, wanted=min(errors), seconds=seconds / 5, push=push)
         question = Question(problem, truth, norm, scale, push, deadline)
         doubt = float(truth.doubt(norm, scale).max())
         found, untried = _explored_all(
-            question, candidates(scene) if methods is None else list(methods), min(errors), bar
+            question, candidates(scene) if methods is None else list(methods), min(errors), shown
         )
         answers, compiled = [], {}
         for wanted in errors:
-            bar.set_postfix_str(f"error {wanted:g}")
+            shown.set_postfix_str(f"error {wanted:g}")
             kept = _kept(question, found, wanted, doubt, dtypes, compiled) if doubt < KNOWN * wanted else []
             answers.append(_answer(question, found, kept, wanted, doubt, untried))
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
@@ -192,12 +191,6 @@ def _asked(scene: Scene, error: Any, horizon: float, frames: int) -> tuple[Probl
     if span.ndim:
         raise ValueError(f"horizon [s]: got shape {span.shape}, expected one number.")
     return Problem(scene, float(horizon), frames=positive_integer("frames", frames)), [float(e) for e in errors]
-
-
-def _bar(progress: bool) -> Any:
-    from tqdm import tqdm
-
-    return tqdm(desc="recommend", unit="method", file=sys.stderr, disable=not progress, leave=False)
 
 
 def candidates(scene: Scene) -> list[Callable]:

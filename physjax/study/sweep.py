@@ -25,16 +25,15 @@ Without a coordinator, as an array of jobs that know nothing of each other, `--a
 `sweep(..., out="/scratch/ranges", shard=(int(os.environ["SLURM_ARRAY_TASK_ID"]), 8))`; afterwards `sweep.load`.
 """
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from physjax.checks import positive_integer
+from physjax.show.report import progress_bar
 from physjax.study import chunks
 from physjax.study.axes import Lanes, checked_lanes, latin_hypercube, sobol
 from physjax.study.chunks import InMemory, Store
@@ -124,9 +123,7 @@ def _compute(
     done = {chunk for chunk, path in store.finished().items() if chunk in mine and store.read(path)}
     left = [chunk for chunk in mine if chunk not in done]
     count = lambda some: sum(stop - start for start, stop in map(store.range, some))  # noqa: E731
-    with tqdm(
-        total=count(mine), initial=count(done), unit="lane", unit_scale=True, file=sys.stderr, disable=not progress
-    ) as bar:
+    with progress_bar(progress=progress, total=count(mine), initial=count(done), unit="lane", unit_scale=True) as shown:
         run = compiled(program, cut, devices) if left else None
         for chunk in left:
             start, stop = store.range(chunk)
@@ -137,7 +134,7 @@ def _compute(
             ]
             found = [np.asarray(leaf).reshape(-1, *leaf.shape[2:])[: stop - start] for leaf in run(*points)]
             store.write(chunk, dict(zip(store.manifest["outputs"], found, strict=True)))
-            bar.update(stop - start)
+            shown.update(stop - start)
 
 
 def _manifest(lanes: Lanes, program: Traced, cut: Layout) -> dict[str, Any]:
