@@ -156,7 +156,8 @@ def _carried(motion: Callable, scene: Scene, thrust: tuple[Array, Array], t: Arr
     """The motion for a time h that begins with half of the reactions' impulse."""
     x, q, p, spin = scene.state
     state = RigidBodies(x, q, p + scale(h / 2, thrust[0]), spin + scale(h / 2, thrust[1]))
-    return motion(scene.having(state=state), t, h).state
+    # coupled bodies have one step, not one each: a method that chooses its own may ask
+    return motion(scene.having(state=state), t, h[..., 0] if scene.couples else h).state
 
 
 def _landed(scene: Scene, end: RigidBodies, on: Array, kick: Array, t: ArrayLike) -> RigidBodies:

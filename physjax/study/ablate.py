@@ -55,6 +55,8 @@ class Effect(NamedTuple):
 class Ablation(NamedTuple):
     """What each part of a scene is worth for an outcome. Printed, it is a table; `notes` say what could not be left out.
 
+    Printed are the change of the outcome, its numerical error, the share of the run time saved and the flops of a step.
+
     `whole` is the run with everything; `matters` the change that counts, shaped like the outcome.
     """
 
@@ -70,17 +72,9 @@ class Ablation(NamedTuple):
         return next(effect for effect in self.effects if effect.name == name)
 
     def __str__(self) -> str:
-        headers = [
-            "without",
-            "changes the outcome by",
-            "numerical error",
-            "saves time",
-            "flops a step",
-            "bytes a step",
-            "verdict",
-        ]
+        headers = ["without", "changes by", "error", "saves", "flops", "verdict"]
         rows = [
-            [e.name, *map(_number, self.telling(e)[:2]), self._saving(e), _count(e.flops), _count(e.bytes), e.verdict]
+            [e.name, *map(_number, self.telling(e)[:2]), self._saving(e), _count(e.flops), e.verdict]
             for e in (self.whole._replace(name="(nothing)"), *self.effects)
         ]
         rows[0][-1] = ""
@@ -88,7 +82,7 @@ class Ablation(NamedTuple):
         run = (
             f"{self.method}, dt = {seconds_text(self.dt)}; what counts is a change of the outcome by more than {counts}"
         )
-        return "\n".join([run, table(headers, rows, align="<>>>>><"), *self.notes])
+        return "\n".join([run, table(headers, rows, align="<>>>><"), *self.notes])
 
     def telling(self, effect: Effect) -> tuple[float, float, float]:
         """Change, numerical error and what counts, for the entry that most exceeds what counts or can be told."""
@@ -102,8 +96,7 @@ class Ablation(NamedTuple):
             return "not timed"
         if effect.saved == 0:
             return "none"
-        share = effect.saved / self.whole.seconds
-        return f"{100 * share:.0f} % ({'' if share > 0 else '-'}{seconds_text(abs(effect.saved))})"
+        return f"{100 * effect.saved / self.whole.seconds:.0f} %"
 
     def plot(self, figure: Any = None) -> Any:
         """Draw the changes beside the numerical errors, and the time saved; returns the matplotlib figure."""

@@ -28,6 +28,11 @@ class Best(NamedTuple):
     index: tuple[int, ...]
     score: float
 
+    def __str__(self) -> str:
+        """The point, and the values where they have names."""
+        parts = [self.point, self.values] if isinstance(self.values, dict) else [self.point]
+        return ": ".join(", ".join(f"{name} = {np.asarray(value)}" for name, value in part.items()) for part in parts)
+
 
 @dataclass(frozen=True, eq=False)
 class Sweep:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Scene, energy, forces, inertia, methods, rigid, simulate
+from physjax import Scene, contacts, energy, forces, inertia, methods, rigid, simulate
 
 ROD = inertia.box(1.0, (0.05, 0.4, 0.05))
 ENDS = [[0.0, -0.2, 0.0], [0.0, 0.2, 0.0]]
@@ -52,6 +52,18 @@ def test_a_hinge_turns_about_its_axis_alone():
     film = simulate(Scene(start, ROD, (hinge,), pinned=held), methods.rk4, dt=5e-4, steps=1000, save_every=1000)
     angle = 2 * math.asin(float(film.state.orientation[-1, 1, 3]))
     assert angle == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_chain_that_falls_on_the_floor_runs_adaptively_too():
+    scene, _ = chain(n=2, damping=300.0, acting=(forces.Gravity(),), orientation=(1.0, 0.0, 0.0, 0.1))
+    floor = contacts.Plane((0.0, -0.7, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(0.5, 0.5))
+    scene = scene.having(contacts=(rigid.Touch(rigid.Hull.box((0.05, 0.4, 0.05)), floor),))
+    fine = simulate(scene, methods.rk4, dt=2e-4, steps=1500, save_every=1500)
+    own = simulate(scene, methods.adaptive(methods.rk4, 1e-8, 1e-8), dt=2e-3, steps=150, save_every=150)
+    assert own.ok
+    np.testing.assert_allclose(own.position[-1], fine.position[-1], atol=2e-3)
+    assert float(fine.position[-1, 1, 1]) < -0.48  # it lies there
 
 
 @pytest.mark.usefixtures("unannotated")
