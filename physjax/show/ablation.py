@@ -4,7 +4,13 @@ from typing import Any
 
 import numpy as np
 
-COLOURS = {"needed": "#D55E00", "costs more than it gives": "#CC79A7", "negligible": "#56B4E9", "none": "0.7"}
+COLOURS = {
+    "needed": "#D55E00",
+    "shorter dt": "#E69F00",
+    "costs more than it gives": "#CC79A7",
+    "negligible": "#56B4E9",
+    "none": "0.7",
+}
 """By verdict."""
 
 

@@ -20,6 +20,8 @@ from physjax.study.removals import Removal, removals, two_at_once
 from physjax.study.running import answers_late
 
 NEEDED, NEGLIGIBLE, COSTLY, NONE = "needed", "negligible", "costs more than it gives", "none"
+BLURRED = "shorter dt"
+"""What is left runs too inaccurately to tell, though the whole did not: damping that kept a method stable, say."""
 SAMPLE, FEWEST, ROUNDS = 0.01, 3, 15
 """A timing is the least of runs that last so long together [s]; at least and at most so many of each."""
 COSTS = 0.1
@@ -49,7 +51,7 @@ class Effect(NamedTuple):
     def verdict(self) -> str:
         """Needed where any entry of the outcome needs it; none where all do without and cannot tell."""
         found = set(self.verdicts.ravel().tolist())
-        return next(verdict for verdict in (NEEDED, COSTLY, NEGLIGIBLE, NONE) if verdict in found)
+        return next(verdict for verdict in (NEEDED, BLURRED, COSTLY, NEGLIGIBLE, NONE) if verdict in found)
 
 
 class Ablation(NamedTuple):
@@ -131,7 +133,8 @@ def ablate(
 
     A part is needed if that changes the outcome by more than `error` times `scale`, the outcome's own size unless given,
     negligible if less; it costs more than it gives if it is negligible and takes a tenth of the time or more; and a change
-    below the numerical error, estimated by runs with shorter steps, is none. Times are the least of several, all runs
+    below the numerical error, estimated by runs with shorter steps, is none, or "shorter dt" where the whole would have
+    been accurate enough to tell. Times are the least of several, all runs
     in turn, within some `seconds` [s]; a difference within the timer's spread is none, 0 times nothing. Compiles each
     variant twice. Raises ValueError or TypeError for bad input.
 
@@ -181,14 +184,17 @@ def _effect(
     numerical, change = np.maximum(off, uncertain), np.abs(now - value)
     saved, spread = clock[0] - timed[0], max(timed[1], clock[1])
     saved = saved if abs(saved) > spread else 0.0
-    verdicts = _verdicts(change, numerical, matters, saved > COSTS * clock[0])
+    verdicts = _verdicts(change, uncertain, off, matters, saved > COSTS * clock[0])
     return Effect(name, now, change, numerical, timed[0], saved, spread, *cost, verdicts)
 
 
-def _verdicts(change: np.ndarray, numerical: np.ndarray, matters: np.ndarray, costs: bool) -> np.ndarray:
-    """A verdict for each entry; a change that is not a number is needed."""
+def _verdicts(
+    change: np.ndarray, uncertain: np.ndarray, off: np.ndarray, matters: np.ndarray, costs: bool
+) -> np.ndarray:
+    """A verdict for each entry, by the numerical errors of the whole and without; a change that is no number is needed."""
     little = np.where(change <= matters, COSTLY if costs else NEGLIGIBLE, NEEDED)
-    return np.where(change <= numerical, NONE, little)
+    cannot_tell = np.where((off > matters) & (uncertain <= matters) & (matters > 0), BLURRED, NONE)
+    return np.where(change <= np.maximum(off, uncertain), cannot_tell, little)
 
 
 def _run(scene: Scene, method: Callable, dt: float, steps: int, save_every: int) -> Any:

@@ -8,7 +8,7 @@ import pytest
 from physjax import Particles, Scene, accuracy, contacts, emitters, forces, lattices, methods, reference, simulate
 from physjax.scenes import SCENES
 from physjax.scenes.gallery import table
-from physjax.study.ablate import COSTLY, NEEDED, NEGLIGIBLE, NONE, _verdicts
+from physjax.study.ablate import BLURRED, COSTLY, NEEDED, NEGLIGIBLE, NONE, _verdicts
 from physjax.study.removals import removals, two_at_once
 
 UNTIMED = {"seconds": 0.0}
@@ -151,8 +151,8 @@ def test_the_third_dimension_stays_where_something_leaves_the_plane():
 
 def test_a_verdict_weighs_the_change_against_what_counts_and_what_is_numerical():
     change, numerical, matters = np.array([1e-9, 1e-4, 1.0, np.nan]), np.full(4, 1e-6), np.full(4, 1e-3)
-    assert _verdicts(change, numerical, matters, False).tolist() == [NONE, NEGLIGIBLE, NEEDED, NEEDED]
-    assert _verdicts(change, numerical, matters, True).tolist() == [NONE, COSTLY, NEEDED, NEEDED]
+    assert _verdicts(change, numerical, numerical, matters, False).tolist() == [NONE, NEGLIGIBLE, NEEDED, NEEDED]
+    assert _verdicts(change, numerical, numerical, matters, True).tolist() == [NONE, COSTLY, NEEDED, NEEDED]
 
 
 @pytest.mark.slow
@@ -190,3 +190,15 @@ def test_bad_input_is_told_in_plain_words(unannotated):
         accuracy.ablate(scene, 3.0, **run)
     with pytest.raises(ValueError, match="index into the last axis"):
         accuracy.ablate(scene, lambda f: f.position[-1], lanes={"moon": 2}, **run)
+
+
+def test_damping_that_keeps_a_method_stable_is_not_called_none():
+    swing = Scene(
+        Particles(jnp.ones(1), jnp.zeros(1)),
+        forces=(forces.Anchor(jnp.zeros(1), stiffness=100.0), forces.StokesDrag(10.0)),
+    )
+    found = accuracy.ablate(
+        swing, lambda f: f.position[-1], method=methods.euler, dt=0.05, duration=10.0, scale=1.0, seconds=0.0
+    )
+    assert np.isfinite(found["StokesDrag"].outcome).all()
+    assert found["StokesDrag"].verdict == BLURRED
