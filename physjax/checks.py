@@ -69,6 +69,13 @@ def real_quantity(
     return array
 
 
+def demand_direction(name: str, vector: Array) -> None:
+    """Raise a ValueError for a zero vector, which has none."""
+    values = concrete(vector)
+    if values is not None:
+        demand(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
+
+
 def quantity(
     name: str, unit: str, *, above: int | float | None = None, at_least: int | float | None = None, **options: Any
 ) -> Any:

@@ -15,7 +15,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, quantity
+from physjax.checks import concrete, demand, demand_direction, quantity
 from physjax.physics.edges import Corners, Nearest, nearest_on_segment, respond_segment, touching_corners
 from physjax.physics.impact import impact
 from physjax.physics.rebound import Coulomb, rebound
@@ -166,7 +166,7 @@ class Plane(Surface):
     normal: Float[Array, "..."] = quantity("normal of the plane", "1")
 
     def __check_init__(self):
-        _demand_direction("normal of the plane", self.normal)
+        demand_direction("normal of the plane", self.normal)
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """(X - P)·N [m]."""
@@ -193,7 +193,7 @@ class Slab(Surface):
     inside: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        _demand_direction("normal of the slab", self.normal)
+        demand_direction("normal of the slab", self.normal)
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearer face [m]."""
@@ -359,12 +359,6 @@ def _touching(wall: Surface, state: Particles) -> Array:
     on = jnp.abs(wall.gap(0.0, x)) <= rounding * norm(x)
     along = normal_speed * normal_speed <= rounding**2 * dot(v, v)
     return lax.stop_gradient(jnp.where(on & along, 0.0, jnp.inf).astype(state.dtype))
-
-
-def _demand_direction(name: str, vector: Array) -> None:
-    values = concrete(vector)
-    if values is not None:
-        demand(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
 
 
 __all__ = [

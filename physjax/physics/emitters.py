@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from physjax.checks import concrete, demand, positive_integer, quantity
+from physjax.checks import concrete, demand, demand_direction, positive_integer, quantity
 from physjax.lanes import on_runs
 from physjax.particles import Particles, demand_particles
 from physjax.physics.looks import Appearance, Look
@@ -108,6 +108,8 @@ class Emitter(eqx.Module):
                 demand(f"spread of the {name} [1]", value, concrete(value) < 1, "numbers from 0 to below 1")
         if concrete(self.cone) is not None:
             demand("half-angle of the cone [rad]", self.cone, concrete(self.cone) <= 3.1416, "numbers from 0 to π")
+        if self.direction is not None:
+            demand_direction("direction", self.direction)
         if not self.drop_oldest:
             self._demand_room()
 

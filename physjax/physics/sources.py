@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from physjax.checks import concrete, demand, quantity
+from physjax.checks import concrete, demand, demand_direction, quantity
 from physjax.vectors import components, over, scale, stacked, turn_left
 
 
@@ -72,6 +72,9 @@ class Disc(Source):
     center: Float[Array, "dim"] = quantity("center of the disc", "m")
     normal: Float[Array, "dim"] = quantity("normal of the disc", "1")
     radius: Float[Array, ""] = quantity("radius of the disc", "m", at_least=0)
+
+    def __check_init__(self):
+        demand_direction("normal of the disc", self.normal)
 
     @property
     def dim(self) -> int:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
@@ -45,7 +46,7 @@ def fit(predict: Callable, guess: Any, observed: Any, *, sigma: Any = None, max_
 
     Example:
         >>> fallen = lambda g: 0.5 * g * jnp.array([1.0, 4.0, 9.0])
-        >>> round(float(fit(fallen, guess=5.0, observed=np.array([4.9, 19.6, 44.1])).value), 3)
+        >>> round(float(fit(fallen, guess=5.0, observed=[4.9, 19.6, 44.1]).value), 3)
         9.8
     """
     if not callable(predict):
@@ -56,6 +57,8 @@ def fit(predict: Callable, guess: Any, observed: Any, *, sigma: Any = None, max_
     guess = jax.tree.map(lambda leaf: real_quantity("guess", leaf), guess)
     start, unravel = ravel_pytree(guess)
     seen = jax.eval_shape(predict, guess)
+    if isinstance(seen, jax.ShapeDtypeStruct) and isinstance(observed, list | tuple):
+        observed = np.asarray(observed)  # what NumPy takes for an array is one here too, not a tree of numbers
     observed = _matched("observed", jax.tree.map(lambda leaf: jnp.asarray(leaf), observed), seen)
     data, unravel_data = ravel_pytree(observed)
     present = ~jnp.isnan(data)
