@@ -6,7 +6,7 @@ leave get half of the reaction's impulse at the start and half at the end of eac
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxtyping import Array
 from physjax.lanes import any_lane, apart
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_acceleration, angular_velocity
-from physjax.physics.impact import IMPACTS, SHORTEST_FLIGHT, Dip, chosen, dip_of, hair
+from physjax.physics.impact import IMPACTS, SHORTEST_FLIGHT, Dip, Flight, chosen, dip_of, hair
 from physjax.physics.impulses import Points, impulses
 from physjax.roots import first_root
 from physjax.scene import Scene
@@ -55,11 +55,9 @@ def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scen
     which a point would fly for less than a quarter of a step is the last, where K_r < 1. Coupled bodies share their
     step, which cannot be cut for one of them: they are held alike, but impacts are answered at its end.
     """
-    dt = jnp.broadcast_to(dt, scene.state.lanes)
+    leg, dt = _beginning(scene, dt)
     if scene.couples:
         return scene.having(state=_answered_at_the_end(motion, scene, t, dt))
-    arrived = jnp.zeros(dt.shape, bool) if scene.held is None else scene.held
-    leg = _Leg(jnp.zeros_like(dt), scene.state, arrived)
 
     @jax.checkpoint  # reverse mode takes each leg again: what it would remember of one is more than the work
     def further(leg):
@@ -72,10 +70,60 @@ def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scen
     return scene.having(state=leg.state)
 
 
+def collisions(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Callable, total: Any) -> Any:
+    """The legs of the step that `collide` takes, told one by one as by `impact.flights`: what held the bodies is in them.
+
+    Each begins with half of what the surfaces give through it; `after` is what the other half and the impact made of its
+    end. Returns the total and the state after the step.
+    """
+    leg, dt = _beginning(scene, dt)
+
+    def flown(here, thrust, begun, duration, after, flying):
+        start = here.having(state=_pushed(here.state, thrust, duration))
+        end = motion(start, begun, _own(scene, duration)).state
+        return Flight(here.state, start, _own(scene, begun), _own(scene, duration), end, after, flying)
+
+    if scene.couples:
+        thrust = _thrust(scene, _on_now(scene, t, dt), t, dt)
+        after = _answered_at_the_end(motion, scene, t, dt)
+        return add(total, flown(scene, thrust, jnp.broadcast_to(t, dt.shape), dt, after, None)), after
+
+    def fly(leg, total):
+        begun, rest = _left(leg, t, dt)
+        here = scene.having(state=leg.state)
+        thrust = _thrust(here, _on_now(here, begun, dt) & ~leg.arrived[None], begun, rest)
+        after = chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
+        duration = jnp.maximum(after.elapsed - leg.elapsed, hair(dt))
+        return after, add(total, flown(here, thrust, begun, duration, after.state, ~leg.arrived))
+
+    def go_on(carry, _):
+        return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
+
+    (leg, total), _ = lax.scan(go_on, (leg, total), length=IMPACTS + 1)
+    return total, leg.state
+
+
+def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
+    """Where the first leg of a step begins, and the step of each body."""
+    dt = jnp.broadcast_to(dt, scene.state.lanes)
+    arrived = jnp.zeros(dt.shape, bool) if scene.held is None else scene.held
+    return _Leg(jnp.zeros_like(dt), scene.state, arrived), dt
+
+
+def _left(leg: _Leg, t: ArrayLike, dt: Array) -> tuple[Array, Array]:
+    """When a leg begins, and how much of the step is left."""
+    return t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
+
+
+def _own(scene: Scene, number: Array) -> Array:
+    """A number of each body; coupled ones share theirs, and a method that chooses its own steps may ask."""
+    return number[..., 0] if scene.couples else number
+
+
 def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> _Leg:
     """From where the bodies are to the first impact of each, or to the end of the step."""
-    begun, rest = t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
-    here, going = scene.having(state=leg.state), ~leg.arrived
+    (begun, rest), going = _left(leg, t, dt), ~leg.arrived
+    here = scene.having(state=leg.state)
     kick = _kick(here, begun, dt)
     felt = lax.stop_gradient(felt_by(here, begun, leg.state))
     on = _on(felt, leg.state, kick, dt) & going[None]
@@ -97,8 +145,7 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> 
 
 def _answered_at_the_end(motion: Callable, scene: Scene, t: ArrayLike, dt: Array) -> RigidBodies:
     """The whole step held by what touches from its start; impacts answered at its end, and what went in moved out."""
-    kick = _kick(scene, t, dt)
-    on = _on(lax.stop_gradient(felt_by(scene, t, scene.state)), scene.state, kick, dt)
+    kick, on = _kick(scene, t, dt), _on_now(scene, t, dt)
     end = _carried(motion, scene, _thrust(scene, on, t, dt), t, dt)
     end = apart(on, lambda: _landed(scene, end, on, kick, t + dt), end)
     struck = _struck(scene, end, jnp.ones(dt.shape, bool), kick, t + dt, dt)
@@ -141,6 +188,12 @@ def _on(felt: Felt, state: RigidBodies, kick: Array, dt: Array) -> Array:
     return _near(felt, state, kick, dt) & (speed <= SLOW * kick[None] + rounding)
 
 
+def _on_now(scene: Scene, t: ArrayLike, dt: Array) -> Array:
+    """Which points touch and stay, at the scene's own state."""
+    felt = lax.stop_gradient(felt_by(scene, t, scene.state))
+    return _on(felt, scene.state, _kick(scene, t, dt), dt)
+
+
 def _thrust(scene: Scene, on: Array, t: ArrayLike, h: Array) -> tuple[Array, Array]:
     """Force and torque of the reactions over a coming time h, of which the start gives h/2."""
 
@@ -154,10 +207,13 @@ def _thrust(scene: Scene, on: Array, t: ArrayLike, h: Array) -> tuple[Array, Arr
 
 def _carried(motion: Callable, scene: Scene, thrust: tuple[Array, Array], t: ArrayLike, h: Array) -> RigidBodies:
     """The motion for a time h that begins with half of the reactions' impulse."""
-    x, q, p, spin = scene.state
-    state = RigidBodies(x, q, p + scale(h / 2, thrust[0]), spin + scale(h / 2, thrust[1]))
-    # coupled bodies have one step, not one each: a method that chooses its own may ask
-    return motion(scene.having(state=state), t, h[..., 0] if scene.couples else h).state
+    return motion(scene.having(state=_pushed(scene.state, thrust, h)), t, _own(scene, h)).state
+
+
+def _pushed(state: RigidBodies, thrust: tuple[Array, Array], h: Array) -> RigidBodies:
+    """The bodies with half of what the reactions give in a time h."""
+    x, q, p, spin = state
+    return RigidBodies(x, q, p + scale(h / 2, thrust[0]), spin + scale(h / 2, thrust[1]))
 
 
 def _landed(scene: Scene, end: RigidBodies, on: Array, kick: Array, t: ArrayLike) -> RigidBodies:

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.loops import time_at
+from physjax.physics.collide import collide, collisions
 from physjax.physics.contacts import impact, project
 from physjax.physics.impact import Flight, flights
 from physjax.scene import Scene, free_motion
@@ -26,6 +27,8 @@ from physjax.study.limits import force_name
 from physjax.vectors import scale
 
 NUMERICAL, PINS, PIVOTS = "numerical", "pins", "pivots"
+LEGS = {impact: flights, collide: collisions}
+"""How a response tells the legs of its steps. Particles have the one, bodies the other."""
 Books = dict[str, Any]
 """What each cause has brought so far: energy, momentum and, beyond one dimension, angular momentum, by its name."""
 
@@ -132,8 +135,9 @@ def _step(scene: Scene, method: Any, t: Array, dt: Array, substeps: Array, books
     """One step of the run, entered in the books: its motion, touches, what leads nodes, and what parts."""
     motion = partial(free_motion, method)
     enter = partial(_entered, in_float64(scene), substeps)
-    if any(contact.response is impact for contact in scene.contacts):
-        books, moved = flights(motion, scene, t, dt, enter, books)
+    responses = {contact.response for contact in scene.contacts}
+    if responses & LEGS.keys():
+        books, moved = LEGS[(responses & LEGS.keys()).pop()](motion, scene, t, dt, enter, books)
     else:
         moved = motion(scene, t, dt).state
         books = enter(books, Flight(scene.state, scene, t, dt, moved, moved, None))
@@ -148,8 +152,8 @@ def _step(scene: Scene, method: Any, t: Array, dt: Array, substeps: Array, books
         led = scene.led.lead(t + dt, moved)
         books, moved = change(books, NUMERICAL, has(moved), has(led)), led
     for name, contact in zip(named(scene.contacts), scene.contacts, strict=True):
-        if contact.response is project:
-            answered = contact.respond(t + dt, moved)
+        if (contact.response or project) is project:
+            answered = contact.answered(t + dt, moved, scene.mass)
             books, moved = change(books, name, has(moved), has(answered)), answered
     # held nodes that a contact moved are put back; without pins there is nothing left but rounding
     books = change(books, PINS if scene.pinned is not None else NUMERICAL, has(moved), has(after.state))
@@ -171,15 +175,16 @@ def _entered(whole: Scene, substeps: Array, books: Books, flight: Flight) -> Boo
     names, contacts, _ = causes(whole)
     entries = dict(zip(names, works, strict=True))
     entries[NUMERICAL] = _minus(has(t + duration, end), has(t + duration, exact))
-    timed = [contact.response is impact for contact in whole.contacts]
+    timed = [contact.response in LEGS for contact in whole.contacts]
     if any(timed):
         entries |= _shared(contacts, _nearest(whole, timed, t, before), _minus(has(t, start.state), has(t, before)))
         touch = _minus(has(t + duration, after), has(t + duration, end))
         entries = _sum(entries, _shared(contacts, _nearest(whole, timed, t + duration, end), touch))
         lean = _nearest(whole, timed, t, start.state)
         if whole.held is not None:
-            entries[PINS] = _where(whole.held, holding)
-            lean = [share & ~whole.held for share in lean]
+            held = jnp.ones(whole.status_shape, bool) if whole.couples else whole.held
+            entries[PINS] = _where(held, holding)
+            lean = [share & ~held for share in lean]
         entries = _sum(entries, _shared(contacts, lean, holding))
     elif PINS in books or PIVOTS in books:
         entries[PINS if PINS in books else PIVOTS] = holding
@@ -189,12 +194,14 @@ def _entered(whole: Scene, substeps: Array, books: Books, flight: Flight) -> Boo
 
 
 def _nearest(scene: Scene, timed: list[bool], t: Array, state: Any) -> list[Array]:
-    """For each contact, whether it is the nearest of those that time their impacts."""
-    gaps = [
-        jnp.abs(c.gap(t, state.position)) if is_timed else None
-        for c, is_timed in zip(scene.contacts, timed, strict=True)
-    ]
-    far = jnp.full(state.lanes, jnp.inf)
+    """For each contact, whether it is the nearest of those that time their impacts; of coupled lanes, to any of them."""
+
+    def gap(contact):
+        found = jnp.abs(contact.clearance(t[..., None] if scene.couples else t, state))
+        return jnp.min(found, axis=-1) if scene.couples else found
+
+    gaps = [gap(c) if is_timed else None for c, is_timed in zip(scene.contacts, timed, strict=True)]
+    far = jnp.full(scene.status_shape, jnp.inf)
     nearest = jnp.argmin(jnp.stack([far if gap is None else gap for gap in gaps]), axis=0)
     return [nearest == i for i in range(len(gaps))]
 

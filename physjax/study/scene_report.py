@@ -14,6 +14,7 @@ from physjax.show.report import Picture, Section, Table, drawn, seconds_text
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
+from physjax.study.booking import LEGS
 from physjax.study.problem import Problem
 from physjax.study.survey import fastest_moment, map_around
 from physjax.study.work_precision import ERRORS, Run, WorkPrecision
@@ -133,7 +134,7 @@ def _ledger(studied: Studied) -> Iterator[Block]:
     if scene.emitter is not None:
         yield "No ledger: particles bring energy when they are born and take it when they die."
         return
-    if any(contact.response not in (impact, project) for contact in scene.contacts):
+    if any((contact.response or project) not in (*LEGS, project) for contact in scene.contacts):
         yield "No ledger: a contact has a response of its own, and what it does to a touch is not known."
         return
     if studied.run is None:

@@ -7,6 +7,7 @@ import pytest
 
 from physjax import Particles, Scene, contacts, energy, forces, inertia, lattices, methods, rigid, simulate, springs
 from physjax.pins import Pins
+from physjax.scenes import SCENES
 
 CLOSED = 1e-9
 
@@ -129,6 +130,34 @@ def test_a_kick_and_a_turning_body_on_a_pivot():
     assert abs(books.energy.totals["pivots"]) < 1e-12
 
 
+@pytest.mark.slow
+def test_a_ball_that_slides_until_it_rolls_loses_two_sevenths():
+    ball = inertia.sphere(6.0, 0.1)
+    lane = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(0.2, 0.2))
+    start = rigid.bodies(ball, (0.0, 0.1, 0.0), velocity=(4.0, 0.0, 0.0))
+    scene = Scene(start, ball, (forces.Gravity(),), (rigid.Touch(rigid.Hull.sphere(0.1), lane),))
+    books = energy.ledger(simulate(scene, methods.rk4, dt=0.01, steps=80, save_every=20))
+    closes(books)
+    np.testing.assert_allclose(books.energy.totals["Touch"], 2 / 7 * 0.5 * 6.0 * 4.0**2, rtol=1e-9)
+    np.testing.assert_allclose(books.energy.totals["numerical"], 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_jointed_bodies_and_balls_that_hit_each_other_close_too():
+    rods, balls = inertia.box(1.0, (0.05, 0.4, 0.05)), inertia.sphere(1.0, 0.5)
+    floor = contacts.Plane((0.0, -0.7, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(0.5, 0.5))
+    touch = rigid.Touch(rigid.Hull.box((0.05, 0.4, 0.05)), floor)
+    joint = rigid.Joints([[0, 1]], [[[0.0, -0.2, 0.0], [0.0, 0.2, 0.0]]], 1e4, 100.0)
+    chain = rigid.bodies(rods, [[0.0, 0.0, 0.0], [0.0, -0.4, 0.0]], velocity=(1.0, -2.0, 0.0))
+    row = rigid.bodies(balls, [[0.0, 0.0, 0.0], [1.01, 0.0, 0.0]], velocity=[[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    hit = Scene(row, balls, contacts=(rigid.Balls(0.5, restitution=0.5),))
+    for scene, dt in ((Scene(chain, rods, (forces.Gravity(), joint), (touch,)), 1e-3), (hit, 0.01)):
+        books = energy.ledger(simulate(scene, methods.rk4, dt=dt, steps=100, save_every=50))
+        closes(books)
+        assert books.energy.totals["Touch" if scene.forces else "Balls"] > 0.01
+    np.testing.assert_allclose(books.energy.totals["Balls"], 0.5 * 0.5 * 2.0**2 * (1 - 0.5**2), rtol=1e-9)
+
+
 def test_a_float32_run_is_audited_in_float64_and_its_rounding_is_the_methods():
     with jax.enable_x64(False):
         flight = simulate(thrown(), methods.rk4, dt=0.02, steps=100, save_every=20)
@@ -153,3 +182,5 @@ def test_bad_input_is_told_in_plain_words(unannotated):
     flight = simulate(thrown(), methods.rk4, dt=0.02, steps=10, record=lambda t, s: s.position)
     with pytest.raises(ValueError, match="its method or its states"):
         energy.ledger(flight)
+    with pytest.raises(ValueError, match="got a scene with an emitter"):
+        energy.ledger(simulate(SCENES["sparks"]().scene, methods.verlet, dt=0.01, steps=2))
