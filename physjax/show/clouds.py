@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from physjax.show import lights
@@ -79,11 +80,13 @@ def cloud_of(who: str, film: Any, density: bool | None) -> tuple[Take, Cloud | C
     if film.scene is None or film.scene.emitter is None:
         raise ValueError(f"{who}: got a run without an emitter, expected Scene(..., emitter=...).")
     emitter = film.film.emitter
+    # births are drawn at random in the run's own floats: in others they are others
+    with jax.enable_x64(film.time.dtype == np.float64):
+        alive, look = emitter.alive(film.time), emitter.appearance(film.time)
     if emitter.pool >= MANY if density is None else density:
-        crowd = Crowd(np.asarray(emitter.alive(film.time)))
+        crowd = Crowd(np.asarray(alive))
         label = f"particles in a cell of {lights.CELL:g} x {lights.CELL:g} points"
         return seen, crowd, lambda figure, where: bar_below(figure, where, crowd.colours(), label, extend="max")
-    look = emitter.appearance(film.time)
     colour = np.concatenate([look.colour, np.asarray(look.opacity)[..., None]], axis=-1)
     glows = film.scene.emitter.look.glows
     return seen, Cloud(np.asarray(look.alive), np.asarray(look.size), np.clip(colour, 0.0, 1.0), glows), None

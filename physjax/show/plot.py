@@ -243,7 +243,9 @@ def _mark_horizon(ax: Any, time: np.ndarray, position: np.ndarray, horizon: floa
         ax.axvline(horizon, color="0.2", linestyle="--")
     else:
         ax.plot(*position[np.searchsorted(time, horizon)].T, "o", color="0.2", markerfacecolor="white")
-    ax.set_title(f"{ax.get_title()}\nchaos: beyond {seconds_text(horizon)} (marked) errors mean nothing", fontsize=10)
+    words = f"chaos: beyond {seconds_text(horizon)} (marked) errors mean nothing"
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1}
+    ax.annotate(words, (0.02, 0.02), xycoords="axes fraction", fontsize=8.5, bbox=box)
 
 
 def _more(panels: Any, result: Any) -> None:

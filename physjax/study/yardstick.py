@@ -26,6 +26,8 @@ COARSE = 8
 """Steps between two moments with which our own reference begins; they are doubled."""
 NUDGE = 1e-10
 """The change of the start, in parts of the path, whose growth is looked at: far from rounding and from curvature."""
+FULL_GROWN = 1e-3
+"""What it has become, in parts of the path, when it no longer grows like a small one."""
 
 
 class Yardstick(NamedTuple):
@@ -53,9 +55,16 @@ class Yardstick(NamedTuple):
 
     def horizon(self, error: float, eps: float, norm: Norm = path, scale: Any = None) -> float:
         """The first moment [s] at which rounding of size `eps` has grown beyond an error; infinite if it does not."""
-        over = self.growth(norm, scale) * eps > error
-        late = len(self.times) - len(over)
-        return float(self.times[late + int(np.argmax(over))]) if over.any() else float("inf")
+        growth = self.growth(norm, scale)
+        times = self.times[len(self.times) - len(growth) :]
+        grown = growth * NUDGE > FULL_GROWN
+        if grown.any():
+            # two paths that have parted part no further; rounding is still smaller, and grows on as the nudge did
+            since = int(np.argmax(grown))
+            rate = np.log(growth[since]) / times[since]
+            growth = np.where(np.arange(len(times)) < since, growth, np.exp(np.minimum(rate * times, 700.0)))
+        over = growth * eps > error
+        return float(times[int(np.argmax(over))]) if over.any() else float("inf")
 
     def _apart(self, other: Any, norm: Norm, scale: Any) -> np.ndarray:
         if other is None:
