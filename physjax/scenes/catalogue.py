@@ -84,7 +84,7 @@ def _size(problem: Problem) -> str:
     one, many = ("body", "bodies") if hasattr(state, "orientation") else ("particle", "particles")
     words = f"{lanes} {one if lanes == 1 else many}"
     springs = sum(len(force.pairs) for force in forces if isinstance(force, Springs))
-    joined = f", {springs} springs" if springs else ""
+    joined = f", {springs} spring{'s' * (springs > 1)}" if springs else ""
     return f"{words} in {state.position.shape[-1]}-D{joined}, {seconds_text(problem.duration)}"
 
 

@@ -18,6 +18,8 @@ from physjax.show.panels import Scenery, arranged
 from physjax.show.report import progress_bar
 from physjax.show.takes import Take
 
+SHADED = 12_000
+"""A picture that takes more bytes than this without loss is compressed with some."""
 LONGEST = 600.0
 """A film that plays longer [s] is surely not meant."""
 GREYS, NEARLY_GREY = 32, 8
@@ -134,12 +136,16 @@ class Film:
 
     def _player(self, progress: bool) -> tuple[str, int]:
         """A page with all pictures in it, and buttons; and how high a picture is [pixels]."""
-        pictures = []
-        for picture in self._pictures(progress):
-            data = io.BytesIO()
-            picture.save(data, "WEBP", lossless=True)
-            pictures.append("data:image/webp;base64," + base64.b64encode(data.getvalue()).decode())
-        width, height = picture.size
+        figure, show = self._projector()
+        middle = _picture(figure, show, self.frames[len(self.frames) // 2])
+        width, height = middle.size
+        # lines and points are small and sharp without loss; what is shaded would be large, and shows no loss
+        if len(_webp(middle.quantize(), lossless=True)) <= SHADED:
+            codes = (_webp(picture, lossless=True) for picture in self._pictures(progress))
+        else:
+            drawn = (_picture(figure, show, frame) for frame in _counted(self.frames, progress))
+            codes = (_webp(picture, quality=85) for picture in drawn)
+        pictures = ["data:image/webp;base64," + base64.b64encode(code).decode() for code in codes]
         time = self.scenery.take.time[list(self.frames)]
         paced = time[:-1] if len(time) > 2 else time  # the end is shown when it is due, or a little early
         speed = float(f"{np.polyfit(np.arange(len(paced)), paced, 1)[0] * self.fps:.2g}")
@@ -179,6 +185,12 @@ def _picture(figure: Any, show: Callable, frame: int) -> Any:
     show(frame)
     figure.canvas.draw()
     return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+
+
+def _webp(picture: Any, **options: Any) -> bytes:
+    data = io.BytesIO()
+    picture.save(data, "WEBP", **options)
+    return data.getvalue()
 
 
 def _palette(pictures: list[Any]) -> Any:
