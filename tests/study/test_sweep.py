@@ -158,6 +158,16 @@ def clean_and_with_bad_lanes(measure, lanes, bad, **options):
         np.testing.assert_array_equal(one[same], other[same])
 
 
+def test_one_per_cent_of_bad_lanes_leave_the_roots_of_the_others():
+    """To rounding: on two threads the same search of the same roots differs by a last digit once in 150 000 lanes."""
+    spoilt = np.linspace(1.0, 2.0, 1000)
+    spoilt[::100] = np.resize((np.nan, np.inf), 10)
+    clean, dirty = (quiet(found_roots, {"x": x}, batch=500) for x in (np.linspace(1.0, 2.0, 1000), spoilt))
+    assert clean.ok.all()
+    np.testing.assert_array_equal(dirty.ok, np.isfinite(spoilt))
+    np.testing.assert_allclose(clean.values.value[dirty.ok], dirty.values.value[dirty.ok], rtol=4e-16)
+
+
 def fixed_steps(x):
     return simulate(ball(10 * x, 0.5), methods.rk4, dt=0.02, steps=50, save_every=50).position[-1]
 
@@ -176,7 +186,7 @@ def found_roots(x):
     return solve(lambda y: y**3 + y - x, 1.0)
 
 
-@pytest.mark.parametrize("measure", [fixed_steps, chosen_steps, bounces, found_roots])
+@pytest.mark.parametrize("measure", [fixed_steps, chosen_steps, bounces])
 def test_one_per_cent_of_bad_lanes_leave_the_others_bit_equal(measure):
     clean_and_with_bad_lanes(measure, 1000, (np.nan, np.inf))
 
