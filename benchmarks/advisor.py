@@ -137,7 +137,7 @@ def rivals(name):
         single = in_dtype(problem.scene, jnp.float64)
         many = problem._replace(scene=crowd(single, BATCH), exact=None)
         asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
-        answers = recommend(many.scene, seconds=30, progress=False, **asked)
+        answers = recommend(many.scene, seconds=120, progress=False, **asked)
         truth = yardstick(many)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(single.state))
         solvers = SOLVERS if numbers <= DENSE else SOLVERS[:-1]
@@ -212,6 +212,7 @@ def report(record, folder, quick):
     checked = [row["kept"] for _, row in kept if row["checked"]]
     ratios = [row["ratio"] for _, row in kept if "ratio" in row]
     against = [(name, row) for name, r in record["rivals"].items() for row in r["rows"] if "times" in row]
+    raced = [row.get("times", 0.0) for r in record["rivals"].values() for row in r["rows"] if "diffrax" in row]
     searches = [r["busy"] for r in record["promises"].values()]
     bars = [
         Bar("promises kept, of those checked", float(np.mean(checked or [np.nan])), ">=", 0.98),
