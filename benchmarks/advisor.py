@@ -250,10 +250,11 @@ def report(record, folder, quick):
     record["counted"] |= {"checked": len(checked), "timed": len(ratios), "against_diffrax": len(against)}
     if against:
         foot = f"{harness.caption(record['machine'])}; {done}"
-        draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, foot)
+        silent = [name for name, r in record["rivals"].items() if not any("times" in row for row in r["rows"])]
+        draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, silent, foot)
 
 
-def draw(path, kept, against, foot):
+def draw(path, kept, against, silent, foot):
     """Promises against what was found; times beside the fastest; times beside diffrax."""
     from matplotlib.figure import Figure
 
@@ -262,7 +263,7 @@ def draw(path, kept, against, foot):
     figure = Figure(figsize=(13, 5.4), layout="constrained")
     promise, ratio, rival = figure.subplots(1, 3)
     colours = dict(zip(ERRORS, ("#D55E00", "#009E73", "#0072B2"), strict=True))
-    names = list(dict.fromkeys(name for name, _ in against))
+    names = list(dict.fromkeys([*silent, *(name for name, _ in against)]))
     for error, colour in colours.items():
         mine = [row for _, row in kept if row["error"] == error]
         seen = [(r["promised"] / error, r["found"] / error) for r in mine if r["checked"]]
@@ -280,7 +281,10 @@ def draw(path, kept, against, foot):
     ratio.set_title("beside an exhaustive search")
     rival.set(xlabel=f"time of diffrax's best [ours], {BATCH} copies", xscale="log")
     rival.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
-    rival.set_title("right of the line ours is faster")
+    rival.plot(
+        [0.02] * len(silent), [names.index(n) for n in silent], "x", color="0.2", transform=rival.get_yaxis_transform()
+    )
+    rival.set_title("right: ours is faster; x: no answer")
     promise.set_yscale("log")
     ratio.set_ylim(bottom=0)
     for ax in (promise, ratio, rival):
@@ -300,7 +304,7 @@ def main():
     given = harness.parsed(parser)
     path = harness.result_path(given.out, "advisor", given.quick, "json")
     record = json.loads(path.read_text()) if path.exists() else {"benchmark": "advisor", "promises": {}, "rivals": {}}
-    record["machine"], started = harness.machine(), time.perf_counter()
+    started = time.perf_counter()
     work = {"promises": promises, "rivals": rivals}
     chosen = given.scenes or [*SCENES, *(f"random:{seed}" for seed in range(RANDOM) if given.part == "promises")]
     for name in chosen if given.part in work else ():
@@ -310,6 +314,7 @@ def main():
             continue
         begun = time.perf_counter()
         record[given.part][name] = work[given.part](name)
+        record["machine"] = harness.machine()
         tell(f"{name}: {time.perf_counter() - begun:.0f} s")
         harness.write_json(path, record)
         jax.clear_caches()
