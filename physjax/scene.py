@@ -7,13 +7,14 @@ earlier axes count scenes. A per-lane number is a scalar or has the shape of the
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
+from functools import wraps
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -294,11 +295,11 @@ class Scene(eqx.Module):
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
-        motion = partial(free_motion, method)
+        motion = Partial(free_motion, as_module(method))
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
-            motion = partial(response, motion)
+            motion = Partial(response, motion)
         after = motion(self, t, dt) if self.emitter is None else self.emitter.live(motion, self, t, dt)
         state = after.state
         if self.led is not None:
@@ -329,6 +330,17 @@ class Scene(eqx.Module):
         status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
         good = jnp.all(jnp.stack(status), axis=0)
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
+
+
+def traced_once(response: Callable) -> Callable:
+    """A response traced once for all who step the same scene: a search with derivatives steps it in many places."""
+    program = jax.jit(response)
+
+    @wraps(response)
+    def respond(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+        return program(motion if isinstance(motion, Partial) else Partial(motion), scene, t, dt)
+
+    return respond
 
 
 def free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:

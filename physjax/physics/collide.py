@@ -20,7 +20,7 @@ from physjax.physics.bodies import RigidBodies, angular_acceleration, angular_ve
 from physjax.physics.impact import IMPACTS, SHORTEST_FLIGHT, Dip, Flight, chosen, dip_of, hair
 from physjax.physics.impulses import Points, impulses
 from physjax.roots import first_root
-from physjax.scene import Scene
+from physjax.scene import Scene, traced_once
 from physjax.vectors import cross, dot, norm, scale
 
 SLOW = 0.1
@@ -48,6 +48,7 @@ class _Leg(NamedTuple):
     arrived: Array
 
 
+@traced_once
 def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """The response of rigid bodies: from impact to impact, at most 8 a body and step, and held in between.
 

@@ -20,7 +20,7 @@ from physjax.lanes import any_lane, apart, on_flagged
 from physjax.physics.holding import Held, carried, hold, nothing_held
 from physjax.physics.rebound import rebound
 from physjax.roots import first_root
-from physjax.scene import Function, Particles, Scene
+from physjax.scene import Function, Particles, Scene, traced_once
 from physjax.vectors import dot
 
 IMPACTS = 8
@@ -29,6 +29,7 @@ SHORTEST_FLIGHT = 0.25
 """A bounce whose flight would be shorter than this share of the step is the last: what would follow is summed."""
 
 
+@traced_once
 def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """The response that finds when each lane touches within the step, bounces it there, and goes on from there.
 
