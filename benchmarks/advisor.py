@@ -138,7 +138,8 @@ def rivals(name):
         many = problem._replace(scene=crowd(single, BATCH), exact=None)
         asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
         answers = recommend(many.scene, seconds=120, progress=False, **asked)
-        truth = yardstick(many)
+        # another truth than the search's, where that is diffrax's
+        truth = yardstick(many, wanted=1e-7, seconds=60.0, own=methods.rk4)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(single.state))
         solvers = SOLVERS if numbers <= DENSE else SOLVERS[:-1]
         found = [run for solver in solvers for run in rival_runs(single, many, truth, solver)]

@@ -144,13 +144,14 @@ def recommend(
 ) -> Recommendation | tuple[Recommendation, ...]:
     """The fastest way to run a scene for `horizon` [s] with at most this `error`; for several errors a tuple, by one search.
 
-    Errors are relative to the extent of the true path (`norm`: see `norms`; or a function (times, states) of your own),
-    or in units of `scale`, at `frames` equally spaced moments. The truth is diffrax's Dopri8; with contacts or forces
-    that remember, our rk4 with far finer steps, judged by Richardson: the answer says which. `methods`: the registry and
-    adaptive rk4, unless given; those that promise no more than another in any respect are left out, adaptive ones also
-    where touches are answered at the end of a step, implicit ones where no error leaves the step to stability. With
-    `gradient` the derivative of the path by the start's velocity, in a random direction, must keep the error as well,
-    and its time by forward mode counts. `seconds` of processor time bound the search: what is not reached is said.
+    Errors are relative to the extent of the true path (`norm`: see `norms`; or a function (times, states) of your
+    own), or in units of `scale`, at `frames` equally spaced moments. The truth is diffrax's Dopri8; with contacts,
+    forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson: the answer
+    says which. `methods`: the registry and adaptive rk4, unless given; those that promise no more than another in any
+    respect are left out, adaptive ones also where touches are answered at the end of a step, implicit ones where no
+    error leaves the step to stability. With `gradient` the derivative of the path by the start's velocity, in a
+    random direction, must keep the error as well, and its time by forward mode counts. `seconds` of processor time
+    bound the search: what is not reached is said.
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
 
     Example:
@@ -360,6 +361,8 @@ def _obstacle(question: Question, found: list[Explored], wanted: float, doubt: f
         )
         return f"In float64 an error of {wanted:g} is kept, but {what}. Allow float64 by dtypes."
     ended = "of the search" if question.left() < 0 else f"a run may take ({LONG:g} s)"
+    if not np.isfinite(least):
+        return f"No run held in the time {ended}. Give it more seconds, or fewer lanes: a few tell the error of many."
     return f"No method came below {least:.1e} in the time {ended}; {wanted:g} was asked for."
 
 

@@ -1,7 +1,8 @@
 """The true path that errors are measured by, with its own doubt, and how far the start's rounding carries.
 
-A closed form where there is one; else diffrax; else, through contacts and with forces that remember, our own rk4 with
-far finer steps, whose last refinement tells how wrong it still is (Richardson).
+A closed form where there is one; else diffrax; else, through contacts, with forces that remember and where the state is
+so large that diffrax would take minutes, our own rk4 with far finer steps, whose last refinement tells how wrong it still
+is (Richardson).
 """
 
 import time
@@ -22,6 +23,8 @@ from physjax.study.running import Contender, answers_late, contender, smallest_s
 
 TIGHT, LESS = 1e-13, 4e-13
 """Tolerances of the two references through diffrax: their steps differ by a tenth, and so do their errors."""
+LARGE = 20_000
+"""Numbers in a state beyond which nobody waits for diffrax at such tolerances: a thousand ropes take a quarter of an hour."""
 COARSE = 8
 """Steps between two moments with which our own reference begins; they are doubled."""
 NUDGE = 1e-10
@@ -84,7 +87,7 @@ def yardstick(
     if problem.exact is not None and push is None and own is None:
         states = problem.exact(problem.times)
         return Yardstick(scene, problem.times, states, None, None, None, "closed form")
-    by_diffrax = problem.is_ode and own is None
+    by_diffrax = problem.is_ode and own is None and sum(leaf.size for leaf in jax.tree.leaves(scene.state)) <= LARGE
     solve = _by_diffrax(problem, push) if by_diffrax else _by_own(problem, own or rk4, wanted, seconds, push)
     states, second, slopes, source = solve(scene)
     return Yardstick(scene, problem.times, states, second, solve(nudged(scene, states))[0], slopes, source)

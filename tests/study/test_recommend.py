@@ -56,6 +56,16 @@ def test_the_answer_prints_as_a_table_with_reason_and_evidence(swings):
     assert swings[1].richardson == pytest.approx(swings[1].best.error, rel=0.5)
 
 
+def test_a_state_too_large_for_diffrax_is_measured_by_our_own_fine_steps_as_right(monkeypatch):
+    problem = Problem(spring(), 4.0, frames=8)
+    by_diffrax = yardstick(problem)
+    monkeypatch.setattr("physjax.study.yardstick.LARGE", 3)  # a ball in the plane has four numbers
+    own = yardstick(problem, wanted=1e-7)
+    assert own.source.startswith("own rk4")
+    assert own.doubt().max() < 2e-9
+    assert norms.path.error(own.scene, own.times, own.states, by_diffrax.states) < 2e-9
+
+
 @pytest.mark.slow
 def test_a_random_scene_keeps_its_promise_against_another_reference():
     """Diffrax in the search, our own rk4 with fine steps here."""
