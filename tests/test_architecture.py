@@ -258,21 +258,12 @@ def test_a_free_body_compiles_to_its_quaternion_and_nothing_of_pivots_or_torques
 # import
 
 
-def test_importing_costs_little_and_leaves_diffrax_and_pyplot_for_later():
-    program = """
-import time
-start = time.process_time()
-import jax
-middle = time.process_time()
-import physjax, sys
-end = time.process_time()
-print(middle - start, end - middle, *({"diffrax", "optimistix", "matplotlib.pyplot"} & set(sys.modules)))
-"""
-    runs = [
-        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT.parent)
-        for _ in range(3)
-    ]
-    told = [run.stdout.split() for run in runs]
-    assert [loaded for _, _, *loaded in told] == [[]] * 3
-    ours, jax_alone = (min(float(costs[i]) for costs in told) for i in (1, 0))
-    assert ours <= max(0.3, 0.5 * jax_alone)  # a busy machine slows both
+def test_importing_brings_in_what_a_first_run_needs_and_nothing_else():
+    """What it costs is measured in `benchmarks/throughput.py`; a clock in a test would measure the machine's other work."""
+    program = "import jax, sys; before = set(sys.modules); import physjax; print(*set(sys.modules) - before)"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT.parent)
+    loaded = run.stdout.split()
+    needed = {"physjax", "equinox", "jaxtyping", "wadler_lindig", "typing_extensions", "jax", "numpy"}
+    assert {name.split(".")[0] for name in loaded} <= needed
+    later = ("physjax.study", "physjax.show", "physjax.scenes", "physjax.physics.rigid")
+    assert not [name for name in loaded if name.startswith(later)]

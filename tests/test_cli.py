@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from physjax.cli import main
-from physjax.scenes import SCENES
+from physjax.scenes import FAILURES, SCENES
 from physjax.stepping.methods import METHODS
 
 
@@ -48,10 +48,19 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, ca
     assert "method" not in captured.err  # no progress bar was begun
 
 
+def test_scenes_tells_what_a_scene_is_how_large_and_by_what_it_is_known(capsys):
+    assert main(["scenes", "--only", "kepler", "hanging_rope"]) == 0
+    printed = capsys.readouterr().out
+    assert "kepler: 2 " in printed
+    assert "truth: closed form" in printed
+    assert "hanging_rope: " in printed
+
+
+@pytest.mark.slow
 def test_scenes_lists_the_gallery(capsys):
     assert main(["scenes"]) == 0
     printed = capsys.readouterr().out
-    for name in SCENES:
+    for name in (*SCENES, *FAILURES):
         assert name in printed
 
 

@@ -195,6 +195,7 @@ def test_coupled_nodes_have_moments_of_their_own():
     np.testing.assert_allclose(at.position[..., 1], 0.2, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_moments_of_coupled_nodes_are_differentiable():
     first = lambda offset: jnp.sum(pendulums(offset[0]).crossing(0.2).time[0])  # noqa: E731
     central, reverse = derivatives(first, jnp.zeros(1), jax.grad)

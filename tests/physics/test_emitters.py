@@ -174,6 +174,7 @@ def test_bursts_come_together():
     assert np.asarray(flight.film.emitter.alive(flight.time)).sum(axis=1).tolist() == [0] + [50] * 8
 
 
+@pytest.mark.slow
 def test_the_newly_born_forget_what_their_slot_lay_on():
     """Particles that come to rest on the floor and die there; the next ones fly as if nobody had been there."""
     floor = contacts.Plane(point=(0.0, 0.0, 0.0), normal=UP, restitution=0.0, friction=1.0)

@@ -147,6 +147,7 @@ def test_derivatives_through_one_two_and_three_bounces():
     np.testing.assert_allclose(backward, forward.transpose(1, 0, 2), rtol=1e-9, atol=1e-11 * size.max())
 
 
+@pytest.mark.slow
 def test_the_moment_of_rest_can_be_differentiated():
     def rest(numbers):
         h, restitution = numbers

@@ -66,7 +66,9 @@ DRAGGED = Scene(HUNG.state, HUNG.mass, (*HUNG.forces, rigid.RotationalDrag(0.6))
 # the drift alone turns a free body, and it is of second order
 WITHOUT_TORQUE = {"semi_implicit_euler": 2, "implicit_euler": 2}
 SCENES = {"free": FREE, "on a pivot": HUNG, "with drag": DRAGGED}
-CASES = [(name, method) for name in ("free", "on a pivot") for method in METHODS]
+LONG = pytest.param("on a pivot", "implicit_euler", marks=pytest.mark.slow)
+CASES = [("free", method) for method in METHODS]
+CASES += [LONG if method == "implicit_euler" else ("on a pivot", method) for method in METHODS]
 CASES += [("with drag", method) for method in ("verlet", "leapfrog", "rk4")]
 
 

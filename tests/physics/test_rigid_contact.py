@@ -121,6 +121,7 @@ def test_friction_holds_a_box_on_a_slope_up_to_its_angle_and_not_beyond(share):
     assert way == pytest.approx(pull / 2, rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_belt_takes_a_ball_along():
     ball = inertia.sphere(1.0, 0.1)
     belt = floor(0.0, 0.5, velocity=(2.0, 0.0, 0.0))

@@ -34,6 +34,7 @@ def test_a_stiff_rope_comes_to_rest_in_a_catenary():
     np.testing.assert_allclose(flight.position[-1], curve, rtol=0, atol=1e-3 * length)
 
 
+@pytest.mark.slow
 def test_a_cloth_sags_as_far_under_every_method():
     scene = SCENES["hanging_cloth"]().scene  # near its limit of 1.8 ms, explicit Euler finds another fold
     ends = [

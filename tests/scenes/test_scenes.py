@@ -8,7 +8,7 @@ from physjax import methods, simulate
 from physjax.scenes import SCENES, title
 from physjax.scenes.gallery import table
 
-SLOW = ("car", "ragdoll")
+SLOW = ("car", "ragdoll", "tumbling_box", "rolling", "bowling", "smoke", "sparks")
 """What compiles for many seconds."""
 
 

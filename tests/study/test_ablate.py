@@ -126,6 +126,7 @@ def test_a_float32_program_counts_steps_as_simulate_does():
     assert told["Gravity"].verdict == NONE  # it pulls across
 
 
+@pytest.mark.slow
 def test_what_is_born_stays_born_when_something_else_is_left_out():
     jet = emitters.Emitter(
         60, emitters.Point((0.0, 0.0, 0.0)), key=1, life=1.0, rate=50.0, speed=6.0, direction=(0, 1, 0)

@@ -8,7 +8,7 @@ from physjax import Particles, Scene, forces, methods, simulate, stability
 from physjax.scenes import FAILURES, title
 from physjax.scenes.failures import OMEGA
 
-SLOW = {"stiff_cloth"}
+SLOW = {"stiff_cloth", "damped_cloth"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in FAILURES])
