@@ -162,6 +162,7 @@ def test_the_true_motion_ends_on_the_target_too(windy):
             assert np.abs(end - np.asarray(target[lane])).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_reach_with_drag_is_that_of_brute_force():
     """A fan of 4001 shots: the farthest that any of them comes down is where targets stop to be hit."""
     drag = forces.QuadraticDrag(**BASEBALL, wind=(-4.0, 0.0))
@@ -181,6 +182,7 @@ def test_reach_with_drag_is_that_of_brute_force():
     assert aimed.low.angle[1] == pytest.approx(float(aimed.low.angle[0]), abs=0.02)
 
 
+@pytest.mark.slow
 def test_magnus_buoyancy_and_crosswind_in_space():
     spin = forces.Magnus(area=0.038, coefficient=0.2, axis=(0.0, 1.0, 0.0))
     drag = forces.QuadraticDrag(area=0.038, coefficient=0.25, wind=(2.0, 0.0, -3.0))
