@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,20 +10,26 @@ from jaxtyping import Array
 from physjax.lanes import any_lane, apart, loop
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def first_root(function: Callable, arguments: Any, search: tuple) -> Array:
-    """A root x of `function(x, *arguments)` per lane, which moves with the arguments: dx = -∂f/(∂f/∂x).
+def first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
+    """A root x of `function(x, *arguments)` per lane, which moves with all that the function depends on: dx = -∂f/(∂f/∂x).
 
     `search` holds the bracket, a guess of the values at its ends (positive at the first, negative at the last), which
     lanes are wanted, and the tolerance. A lane whose function does not fall there keeps its root where it is.
     """
+    # a force of the user's may close over a number that is being differentiated
+    function, closed_over = jax.closure_convert(function, search[0][0], *arguments)
+    return _first_root(function, (*arguments, *closed_over), search)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
     return _bracketed_root(lambda x: function(x, *arguments), *search)
 
 
-@first_root.defjvp
+@_first_root.defjvp
 def _first_root_jvp(function, primals, tangents):
     (arguments, search), (moves, _) = primals, tangents
-    x = first_root(function, arguments, search)
+    x = _first_root(function, arguments, search)
     _, shift = jax.jvp(lambda *arguments: function(x, *arguments), arguments, moves)
     _, slope = jax.jvp(lambda x: function(x, *arguments), (x,), (jnp.ones_like(x),))
     falls = search[2] & (slope < 0)
