@@ -236,7 +236,7 @@ def report(record, folder, quick):
     ]
     harness.print_table("promises", ["", "run", "step", "promised", "found", "time / fastest"], rows)
     rows = [
-        [label(n, r), f"{r['ours']} {r['dtype']}", r["seconds"], r["diffrax"], r["its_seconds"], r["times"]]
+        [label(raced_as(n), r), f"{r['ours']} {r['dtype']}", r["seconds"], r["diffrax"], r["its_seconds"], r["times"]]
         for n, r in against
     ]
     harness.print_table(f"{BATCH} copies", ["", "ours", "[s]", "diffrax", "[s]", "times faster"], rows)
@@ -258,6 +258,11 @@ def report(record, folder, quick):
         foot = f"{harness.caption(record['machine'])}; {done}"
         silent = [name for name, r in record["rivals"].items() if not any("times" in row for row in r["rows"])]
         draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, silent, foot)
+
+
+def raced_as(name):
+    """A scene's name, and how much of its duration its copies are run for where that is not all."""
+    return name.replace("_", " ") + (f" ({PART[name]:g} of it)" if name in PART else "")
 
 
 def draw(path, kept, against, silent, foot):
@@ -286,7 +291,7 @@ def draw(path, kept, against, silent, foot):
     ratio.set(xlabel="share of answers", ylabel="time [that of the fastest]", xlim=(0, 1))
     ratio.set_title("beside an exhaustive search")
     rival.set(xlabel=f"time of diffrax's best [ours], {BATCH} copies", xscale="log")
-    rival.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
+    rival.set_yticks(range(len(names)), [raced_as(name) for name in names], fontsize=8)
     rival.plot(
         [0.02] * len(silent), [names.index(n) for n in silent], "x", color="0.2", transform=rival.get_yaxis_transform()
     )
