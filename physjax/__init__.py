@@ -27,6 +27,7 @@ Example:
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from physjax.checks import quantity
 from physjax.physics import forces
 from physjax.pins import Pins
 from physjax.scene import Contact, Field, Force, Particles, Scene, loads
@@ -76,6 +77,7 @@ __all__ = [
     "ode_term",
     "plot",
     "projectile",
+    "quantity",
     "reference",
     "rigid",
     "scenes",

@@ -6,7 +6,7 @@ a bad value there becomes a status of the run (`Trajectory.ok`), never an except
 
 from collections.abc import Iterable
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -54,9 +54,14 @@ def demand(name: str, array: Array, good: ArrayLike, expected: str) -> None:
 
 
 def real_quantity(
-    name: str, value: Any, *, above: int | float | None = None, at_least: int | float | None = None
+    name: str,
+    value: Any,
+    *,
+    above: int | float | None = None,
+    at_least: int | float | None = None,
+    at_most: int | float | None = None,
 ) -> Array:
-    """A finite real array, optionally bounded from below (`above`: strictly)."""
+    """A finite real array, optionally bounded from below (`above`: strictly) and from above."""
     array = real_array(name, value)
     values = concrete(array)
     if values is None:
@@ -64,8 +69,12 @@ def real_quantity(
     demand(name, array, np.isfinite(values), "finite numbers (no NaN or infinity)")
     if above is not None:
         demand(name, array, values > above, f"numbers > {above:g}")
-    if at_least is not None:
+    if at_least is not None and at_most is not None:
+        demand(name, array, (values >= at_least) & (values <= at_most), f"numbers from {at_least:g} to {at_most:g}")
+    elif at_least is not None:
         demand(name, array, values >= at_least, f"numbers >= {at_least:g}")
+    elif at_most is not None:
+        demand(name, array, values <= at_most, f"numbers <= {at_most:g}")
     return array
 
 
@@ -76,21 +85,110 @@ def demand_direction(name: str, vector: Array) -> None:
         demand(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
 
 
-def quantity(
-    name: str, unit: str, *, above: int | float | None = None, at_least: int | float | None = None, **options: Any
-) -> Any:
-    """A dataclass field for a physical number: an array leaf, checked when the module is built.
+VECTORS = ("vector", "place")
+"""Kinds with one component for each dimension of space."""
+KINDS = ("number", *VECTORS, "axial", "rotation", "tensor")
+OWN_AXES = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, "memory": 0, None: 0}
+"""Axes that a quantity has behind those of the lanes and before those of its kind."""
 
-    Where the default is None, None means absent and passes through.
+
+class Quantity(NamedTuple):
+    """What a field of a part of a scene is: its name and unit, what kind of number, what there is one of it for, its bounds.
+
+    `kind`: a "number", a "vector", a "place", an "axial" vector (a number in the plane), a "rotation"
+    (a quaternion) or a "tensor" `(dim, dim)`.
+    `per`: one for all lanes or one per "lane"; a "table" of any length, one for all lanes or one per lane; one per
+    "point", "joint" or "spring"; "memory" of what each lane did in a run; None is shared by all lanes, whatever its shape.
+    """
+
+    name: str
+    unit: str
+    kind: str = "number"
+    per: str | None = "lane"
+    above: int | float | None = None
+    at_least: int | float | None = None
+    at_most: int | float | None = None
+
+    def axes(self, dim: int) -> tuple[int, ...]:
+        """The axes of its kind, in a space of `dim` dimensions."""
+        if self.kind in VECTORS:
+            return (dim,)
+        if self.kind == "tensor":
+            return (dim, dim)
+        if self.kind == "rotation":
+            return (4,)
+        return (3,) if self.kind == "axial" and dim == 3 else ()
+
+    def within_bounds(self, value: Array) -> Array:
+        """Which entries are finite and within the bounds, also of a traced value."""
+        good = jnp.isfinite(value)
+        if self.above is not None:
+            good = good & (value > self.above)
+        if self.at_least is not None:
+            good = good & (value >= self.at_least)
+        if self.at_most is not None:
+            good = good & (value <= self.at_most)
+        return good
+
+
+def quantity(
+    name: str,
+    unit: str,
+    *,
+    kind: str = "number",
+    per: str | None = "lane",
+    above: int | float | None = None,
+    at_least: int | float | None = None,
+    at_most: int | float | None = None,
+    **options: Any,
+) -> Any:
+    """A field of a force, contact or path for a physical number: an array that can be swept and differentiated.
+
+    It says what it is (`kind`, `per`: see `Quantity`), so that a scene can hold it against its lanes: per lane, a number
+    is () or has the shape of the lanes, a vector is (dim,) or (*lanes, dim). Bounds are checked when the module is built;
+    a traced number beyond them makes its lanes NaN. Where the default is None, None means absent and passes through.
+
+    Example:
+        >>> class Engine(Force):
+        ...     thrust: jax.Array = quantity("thrust", "N", at_least=0)
+        ...     gears: jax.Array = quantity("gear ratios", "1", per="table")
+        ...     def __call__(self, t, state, mass):
+        ...         return self.thrust * self.gears[0] * state.velocity
+        >>> print(Engine(2.0, [0.5, 1.2])(0.0, ball, shot.mass))
+        [3. 4.]
     """
     optional = options.get("default", 0.0) is None
+    bounds = {"above": above, "at_least": at_least, "at_most": at_most}
 
     def convert(value):
         if value is None and optional:
             return None
-        return real_quantity(f"{name} [{unit}]", value, above=above, at_least=at_least)
+        return real_quantity(f"{name} [{unit}]", value, **bounds)
 
-    return eqx.field(converter=convert, metadata={"unit": unit}, **options)
+    return eqx.field(converter=convert, metadata=_declared(Quantity(name, unit, kind, per, **bounds)), **options)
+
+
+def declared(
+    name: str,
+    unit: str = "1",
+    *,
+    kind: str = "number",
+    per: str | None = "lane",
+    above: int | float | None = None,
+    at_least: int | float | None = None,
+    **options: Any,
+) -> Any:
+    """A field that is declared as `quantity` declares it, and neither converted nor checked when the module is built."""
+    return eqx.field(metadata=_declared(Quantity(name, unit, kind, per, above, at_least)), **options)
+
+
+def _declared(quantity: Quantity) -> dict[str, Any]:
+    if quantity.kind not in KINDS or quantity.per not in OWN_AXES:
+        raise ValueError(
+            f"{quantity.name}: got kind={quantity.kind!r} and per={quantity.per!r}, expected a kind of {KINDS} and "
+            f"per one of {tuple(OWN_AXES)}."
+        )
+    return {"unit": quantity.unit, "quantity": quantity}
 
 
 def positive_integer(name: str, value: Any, *, at_least: int = 1) -> int:
@@ -121,16 +219,22 @@ def _shown(value: Any) -> str:
     return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
 
 
+def starts_legally(contact: Any, state: Any) -> Array:
+    """Which lanes start on the right side of a contact, but for rounding."""
+    gap = contact.clearance(jnp.zeros((), state.dtype), state)
+    position = jnp.where(jnp.isfinite(state.position), jnp.abs(state.position), 0.0)
+    return gap >= -8 * float(jnp.finfo(state.dtype).eps) * jnp.max(position)
+
+
 def demand_legal(contact: Any, state: Any) -> None:
     """Raise a ValueError naming the lanes that start on the wrong side of a contact by more than rounding."""
-    gap = concrete(contact.clearance(jnp.zeros((), state.dtype), state))
-    if gap is None:
+    legal = concrete(starts_legally(contact, state))
+    if legal is None or legal.all():
         return
-    rounding = 8 * float(jnp.finfo(state.dtype).eps) * float(np.abs(np.asarray(state.position)).max())
-    if (gap < -rounding).any():
-        lanes = np.argwhere(gap < -rounding)
-        where = "it starts" if not gap.ndim else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
-        raise ValueError(
-            f"{type(contact).__name__}: {where} on the wrong side, {-gap.min():.3g} m deep; expected gaps >= 0. "
-            "Move them, or put them on the surface: state = contact.respond(0.0, state)."
-        )
+    gap = np.asarray(contact.clearance(jnp.zeros((), state.dtype), state))
+    lanes = np.argwhere(~legal)
+    where = "it starts" if not gap.ndim else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
+    raise ValueError(
+        f"{type(contact).__name__}: {where} on the wrong side, {-gap.min():.3g} m deep; expected gaps >= 0. "
+        "Move them, or put them on the surface: state = contact.respond(0.0, state)."
+    )

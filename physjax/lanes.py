@@ -23,11 +23,6 @@ WHOLE = 64
 """Scenes with no more coupled nodes are compiled as one piece, which for few nodes runs faster."""
 
 
-def is_per_lane(leaf: Any, lanes: tuple[int, ...]) -> bool:
-    """Whether an array has an entry (a number, a vector, a matrix) for each lane."""
-    return hasattr(leaf, "shape") and leaf.shape[: len(lanes)] == lanes
-
-
 def wide(number: Array, like: Array) -> Array:
     """A number of each scene or lane, with the axes of an array of the state."""
     return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))
@@ -61,11 +56,14 @@ def kept_apart(t: ArrayLike, function: Callable) -> Any:
     return lax.optimization_barrier(function())
 
 
-def on_flagged(function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *others: Any, cut: bool) -> Any:
+def on_flagged(
+    function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *others: Any, masks: Any, cut: bool
+) -> Any:
     """`function(changing, *others)`, computed only if a lane is flagged; it must leave the other lanes as they are.
 
-    `changing` and what comes back are trees of per-lane arrays. With `cut`, and many lanes, only the flagged ones are
-    gathered, in groups of a fixed size, so that the work follows their number; reverse mode goes through.
+    `changing` and what comes back are trees of per-lane arrays; `masks` say of `others` which arrays are. With `cut`, and
+    many lanes, only the flagged ones are gathered, in groups of a fixed size, so that the work follows their number;
+    reverse mode goes through.
     """
     lanes, total = flag.shape, flag.size
     if not cut or total < FEWEST:
@@ -78,7 +76,7 @@ def on_flagged(function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *
     def group(now, first):
         index = _picked(words, upto, first + jnp.arange(size, dtype=jnp.int32))
         pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
-        few = [jax.tree.map(lambda a: pick(by_lane(a)) if is_per_lane(a, lanes) else a, other) for other in others]
+        few = jax.tree.map(lambda a, has_lanes: pick(by_lane(a)) if has_lanes else a, others, masks)
         done = function(jax.tree.map(pick, now), *few)
         # beyond the last flagged lane there is none, and nothing is written
         return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop"), now, done)

@@ -11,7 +11,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete
+from physjax.checks import concrete, declared
 from physjax.particles import Particles, demand_particles
 from physjax.scene import as_module
 from physjax.vectors import components, stacked
@@ -34,7 +34,7 @@ class Pins(eqx.Module):
         [0. 1. 0.] [0. 2. 0.]
     """
 
-    nodes: Bool[Array, "*lanes"]
+    nodes: Bool[Array, "*lanes"] = declared("prescribed nodes", per="memory")
     path: Callable
 
     def __init__(self, nodes: Any, path: Any):

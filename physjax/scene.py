@@ -5,120 +5,34 @@ that attract each other, a cloth's nodes); a force says which. In a coupled scen
 earlier axes count scenes. A per-lane number is a scalar or has the shape of the lanes. SI units, y up.
 """
 
-from abc import abstractmethod
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import demand_legal
 from physjax.lanes import WHOLE, kept_apart
-from physjax.particles import Particles, added, demand_particles, shaped
+from physjax.particles import Particles, added, shaped
+from physjax.parts import (
+    Contact,
+    Field,
+    Force,
+    Function,
+    as_module,
+    changes,
+    listed,
+    plain_functions,
+    prepared_contact,
+    prepared_force,
+    under_one_gravity,
+)
+from physjax.quantities import RECORD, demand_fitting_numbers, lane_mask, may_hide_lanes, spoilt
 from physjax.vectors import scale
-
-
-class Force(eqx.Module):
-    """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
-
-    `couples` says whether a lane's force depends on other lanes. `t` [s] is a scalar or per lane. A conservative force
-    also gives its `potential(t, state, mass)` [J], shaped like the lanes (a shared energy is halved between its two
-    lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
-    One that jumps in time has `during(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
-    `near(t, state, mass) -> force` is its tangent for implicit steps; one that is `definite` always pushes back.
-
-    Example:
-        >>> class Engine(Force):
-        ...     def __call__(self, t, state, mass):
-        ...         return 2.0 * state.velocity
-        >>> print(loads(Scene(ball, forces=(Engine(),)), 0.0))
-        [6. 8.]
-    """
-
-    couples: ClassVar[bool] = False
-
-    @abstractmethod
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """Force on each lane [N]."""
-
-
-class Field(Force):
-    """A force proportional to mass, given as an acceleration [m/s²], so that a falling body never looks its mass up.
-
-    Example:
-        >>> class Tide(Field):
-        ...     def acceleration(self, t, state, mass):
-        ...         return 0.5 * state.position
-        >>> print(Tide()(0.0, ball, shot.mass))
-        [ 0. 10.]
-    """
-
-    @abstractmethod
-    def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """Acceleration of each lane [m/s²]."""
-
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """Force on each lane [N]: mass times the acceleration."""
-        return scale(mass, self.acceleration(t, state, mass))
-
-
-class Contact(eqx.Module):
-    """Something that lanes may not pass. `respond(t, state)` answers every touch, once a step, at its end.
-
-    A `response(motion, scene, t, dt) -> scene` other than `project` decides otherwise when touches are answered;
-    `memory` names the arrays that it changes.
-
-    Example:
-        >>> floor = contacts.Plane(point=(0.0, 0.0), normal=(0.0, 1.0))
-        >>> isinstance(floor, Contact), float(floor.gap(0.0, ball.position))
-        (True, 10.0)
-    """
-
-    couples: ClassVar[bool] = False
-    response: ClassVar[Callable | None] = None
-    memory: ClassVar[tuple[str, ...]] = ()
-
-    @abstractmethod
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
-        """Signed distance to the surface [m], > 0 on the legal side."""
-
-    @abstractmethod
-    def respond(self, t: ArrayLike, state: Particles) -> Particles:
-        """The state after a touch; lanes that touch nothing stay as they are."""
-
-    def forgetting(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
-        """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
-        return self
-
-    def answered(self, t: ArrayLike, state: Any, mass: Any) -> Any:
-        """What `project` takes: `respond`, unless an answer needs the masses."""
-        return self.respond(t, state)
-
-    def clearance(self, t: ArrayLike, state: Any) -> Float[Array, "*lanes"]:
-        """How far each lane is from touching [m]."""
-        return self.gap(t, state.position)
-
-    def demand_fit(self, state: Any, mass: Any) -> None:
-        """Raise a TypeError for what cannot touch it, and a ValueError for lanes that start on the wrong side."""
-        demand_particles("contacts", state, "rigid bodies touch with rigid.Touch(hull, plane)")
-        demand_legal(self, state)
-
-    def prepared(self, state: Any, couples: bool) -> "Contact":
-        """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
-        return self
-
-
-def changes(part: Any) -> Any:
-    """A part of a scene with True in place of each array that its `memory` names, False elsewhere."""
-    mask = jax.tree.map(lambda _: False, part)
-    where = lambda part: [getattr(part, name) for name in part.memory]  # noqa: E731
-    return eqx.tree_at(where, mask, [True] * len(part.memory)) if getattr(part, "memory", ()) else mask
 
 
 def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "Scene":
@@ -142,17 +56,6 @@ def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "S
     return scene.having(state=state)
 
 
-class Function(eqx.Module):
-    """A plain function as part of a scene. It counts as coupling its lanes unless it is said to be independent."""
-
-    function: Callable = eqx.field(static=True)
-    couples: bool = eqx.field(static=True, default=True)
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Call the function."""
-        return self.function(*arguments)
-
-
 class Scene(eqx.Module):
     """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held or led, or born.
 
@@ -168,11 +71,11 @@ class Scene(eqx.Module):
         [ -3.  -13.8]
     """
 
-    state: Any
-    mass: Any
+    state: Any = eqx.field(metadata=RECORD)
+    mass: Any = eqx.field(metadata=RECORD)
     forces: tuple
     contacts: tuple
-    pinned: Bool[Array, "*lanes"] | eqx.Module | None
+    pinned: Bool[Array, "*lanes"] | eqx.Module | None = eqx.field(metadata=RECORD)
     emitter: eqx.Module | None
     reaction: Callable | None = eqx.field(init=False)
 
@@ -202,12 +105,15 @@ class Scene(eqx.Module):
                     f"pinned: got {pinned.dtype} of shape {pinned.shape}, expected booleans of the lanes' shape {lanes}."
                 )
             state = state.held(1 - pinned.astype(dtype))
-        self.state = state
         self.mass = mass
-        self.forces = tuple(_part("force", force, dtype) for force in _listed("force", forces))
-        self.contacts = tuple(_part("contact", contact, dtype) for contact in _listed("contact", contacts))
+        forces = [prepared_force(force, dtype) for force in listed("force", forces)]
+        self.forces = under_one_gravity(forces)
+        self.contacts = tuple(prepared_contact(contact, dtype) for contact in listed("contact", contacts))
+        for part in (*self.forces, *self.contacts):
+            demand_fitting_numbers(part, lanes, state.position.shape[-1])
         for contact in self.contacts:
             contact.demand_fit(state, mass)
+        self.state = state = spoilt(state, mass, (*self.forces, *self.contacts, pinned, emitter), self.contacts)
         self.contacts = tuple(contact.prepared(state, self.couples) for contact in self.contacts)
         self.pinned = pinned
         self.reaction = None
@@ -232,6 +138,18 @@ class Scene(eqx.Module):
     def in_pieces(self) -> bool:
         """Whether a step is compiled in pieces: where more than a few nodes look at each other."""
         return self.couples and self.state.lanes[-1:] > (WHOLE,)
+
+    def may_be_cut(self) -> bool:
+        """Whether some lanes can be stepped without the rest: independent ones, and no part may hide an array of all lanes.
+
+        A plain function may close over one, a path has one, and so may a part whose arrays are not declared.
+        """
+        whole = self.couples or self.led is not None or bool(plain_functions(self.forces))
+        return not whole and not may_hide_lanes(self, self.state.lanes, self.state.position.shape[-1])
+
+    def lane_mask(self, tree: Any) -> Any:
+        """The tree with True in place of each array that has an entry for each lane of this scene, False elsewhere."""
+        return lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
 
     @property
     def status_shape(self) -> tuple[int, ...]:
@@ -363,36 +281,18 @@ def loads(scene: Scene, t: ArrayLike, state: Any = None, *, per_term: bool = Fal
     return terms if per_term else state.total(terms)
 
 
-def as_module(function: Callable) -> eqx.Module:
-    """A plain function wrapped so that it can travel in a pytree; modules are returned as they are."""
-    return function if isinstance(function, eqx.Module) else Function(function)
-
-
-def plain_functions(part: Any) -> list[Function]:
-    """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
-    is_plain = lambda node: isinstance(node, Function)  # noqa: E731
-    return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
-
-
-def _listed(kind: str, parts: Any) -> tuple:
-    """The parts as a tuple; a single one given without it is an easy slip and gets an error that says so."""
-    if callable(parts) or not hasattr(parts, "__iter__"):
-        raise TypeError(f"{kind}s: got {type(parts).__name__}, expected a tuple of {kind}s. Write {kind}s=({kind},).")
-    return tuple(parts)
-
-
-_EXPECTED = {
-    "force": "a force: a callable (t, state, mass) -> newtons",
-    "contact": "a contact, e.g. contacts.Plane(point=(0, 0), normal=(0, 1))",
-}
-
-
-def _part(kind: str, part: Any, dtype: np.dtype) -> eqx.Module:
-    """A force or contact as a pytree whose floating-point numbers have the scene's dtype."""
-    good = isinstance(part, Contact) if kind == "contact" else callable(part) and not isinstance(part, type)
-    if not good:
-        raise TypeError(f"{kind}s: got {type(part).__name__} {part!r}, expected {_EXPECTED[kind]}.")
-    return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf,
-        part if isinstance(part, eqx.Module) else Function(part),
-    )
+__all__ = [
+    "Contact",
+    "Field",
+    "Force",
+    "Function",
+    "Particles",
+    "Scene",
+    "as_module",
+    "changes",
+    "free_motion",
+    "loads",
+    "plain_functions",
+    "project",
+    "traced_once",
+]

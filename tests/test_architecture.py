@@ -23,7 +23,8 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FIL
 
 FLOORS = (
     {"vectors", "checks", "files", "lanes", "loops"},
-    {"roots", "particles"},
+    {"roots", "particles", "quantities"},
+    {"parts"},
     {"scene"},
     {"crossing"},
     {"trajectory", "pins"},

@@ -97,10 +97,12 @@ class Wind(Force):
 
     couples: ClassVar[bool] = True
     surface: Cells | Triangles = eqx.field(static=True)
-    velocity: Float[Array, "..."] = quantity("wind", "m/s")
-    density: Float[Array, "..."] = quantity("density of the air", "kg/m³", at_least=0, default=1.225)
-    normal: Float[Array, "..."] = quantity("normal coefficient C_n", "1", at_least=0, default=1.2)
-    tangential: Float[Array, "..."] | None = quantity("tangential coefficient C_t", "1", at_least=0, default=None)
+    velocity: Float[Array, "..."] = quantity("wind", "m/s", kind="vector", per=None)
+    density: Float[Array, "..."] = quantity("density of the air", "kg/m³", per=None, at_least=0, default=1.225)
+    normal: Float[Array, "..."] = quantity("normal coefficient C_n", "1", per=None, at_least=0, default=1.2)
+    tangential: Float[Array, "..."] | None = quantity(
+        "tangential coefficient C_t", "1", per=None, at_least=0, default=None
+    )
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes 3"]:
         """The wind's push on each node [N]."""

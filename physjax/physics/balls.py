@@ -9,7 +9,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import concrete, demand, demand_legal, quantity
+from physjax.checks import concrete, demand_legal, quantity
 from physjax.lanes import any_lane
 from physjax.physics.bodies import RigidBodies
 from physjax.physics.inertia import Inertia
@@ -42,12 +42,8 @@ class Balls(Contact):
 
     couples: ClassVar[bool] = True
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
-    restitution: Float[Array, "..."] = quantity("restitution K_r", "1", at_least=0, default=1.0)
+    restitution: Float[Array, "..."] = quantity("restitution K_r", "1", at_least=0, at_most=1, default=1.0)
     coulomb: Coulomb | None = None
-
-    def __check_init__(self):
-        if (values := concrete(self.restitution)) is not None:
-            demand("restitution K_r [1]", self.restitution, values <= 1, "numbers from 0 to 1")
 
     def demand_fit(self, state: Any, mass: Any) -> None:
         """Raise a TypeError for a state that is not of rigid bodies, a ValueError for what are not balls side by side."""

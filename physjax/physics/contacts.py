@@ -15,7 +15,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, demand_direction, quantity
+from physjax.checks import concrete, declared, demand, demand_direction, quantity
 from physjax.physics.edges import Corners, Nearest, nearest_on_segment, respond_segment, touching_corners
 from physjax.physics.impact import impact
 from physjax.physics.rebound import Coulomb, rebound
@@ -36,17 +36,22 @@ class Surface(Contact):
         [3. 2.]
     """
 
-    restitution: Float[Array, "..."] = quantity("restitution K_r", "1", at_least=0, default=1.0, kw_only=True)
-    friction: Float[Array, "..."] | None = quantity("friction K_f", "1", at_least=0, default=None, kw_only=True)
+    restitution: Float[Array, "..."] = quantity(
+        "restitution K_r", "1", at_least=0, at_most=1, default=1.0, kw_only=True
+    )
+    friction: Float[Array, "..."] | None = quantity(
+        "friction K_f", "1", at_least=0, at_most=1, default=None, kw_only=True
+    )
     coulomb: Coulomb | None = eqx.field(default=None, kw_only=True)
-    velocity: Float[Array, "..."] | None = quantity("surface velocity", "m/s", default=None, kw_only=True)
+    velocity: Float[Array, "..."] | None = quantity(
+        "surface velocity", "m/s", kind="vector", default=None, kw_only=True
+    )
     response: Callable | None = eqx.field(static=True, default=None, kw_only=True)
-    touching_since: Float[Array, "..."] | None = eqx.field(default=None, kw_only=True)
+    touching_since: Float[Array, "..."] | None = declared(
+        "begin of contact", "s", per="memory", default=None, kw_only=True
+    )
 
     def __check_init__(self):
-        for name, value in (("restitution K_r [1]", self.restitution), ("friction K_f [1]", self.friction)):
-            if value is not None and concrete(value) is not None:
-                demand(name, value, concrete(value) <= 1, "numbers from 0 to 1")
         if self.friction is not None and self.coulomb is not None:
             raise ValueError("contact: got friction= (the lecture's K_f) and coulomb=, expected at most one of them.")
         if self.response is not None and not callable(self.response):
@@ -162,11 +167,15 @@ class Plane(Surface):
         4.0
     """
 
-    point: Float[Array, "..."] = quantity("point of the plane", "m")
-    normal: Float[Array, "..."] = quantity("normal of the plane", "1")
+    point: Float[Array, "..."] = quantity("point of the plane", "m", kind="place")
+    normal: Float[Array, "..."] = quantity("normal of the plane", "1", kind="vector")
 
     def __check_init__(self):
         demand_direction("normal of the plane", self.normal)
+
+    def relations(self) -> tuple[Array, ...]:
+        """What must hold of its numbers, also where they are traced."""
+        return (dot(self.normal, self.normal) > 0,)
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """(X - P)·N [m]."""
@@ -187,13 +196,17 @@ class Slab(Surface):
         9.0
     """
 
-    point: Float[Array, "..."] = quantity("point in the middle of the slab", "m")
-    normal: Float[Array, "..."] = quantity("normal of the slab", "1")
+    point: Float[Array, "..."] = quantity("point in the middle of the slab", "m", kind="place")
+    normal: Float[Array, "..."] = quantity("normal of the slab", "1", kind="vector")
     thickness: Float[Array, "..."] = quantity("thickness", "m", above=0)
     inside: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         demand_direction("normal of the slab", self.normal)
+
+    def relations(self) -> tuple[Array, ...]:
+        """What must hold of its numbers, also where they are traced."""
+        return (dot(self.normal, self.normal) > 0,)
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearer face [m]."""
@@ -231,7 +244,7 @@ class Sphere(Surface):
         6.0
     """
 
-    center: Float[Array, "..."] = quantity("center", "m")
+    center: Float[Array, "..."] = quantity("center", "m", kind="place")
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
     inside: bool = eqx.field(static=True, default=False)
 
@@ -303,13 +316,17 @@ class Room(Surface):
         2.0
     """
 
-    lower: Float[Array, "..."] = quantity("lower corner", "m")
-    upper: Float[Array, "..."] = quantity("upper corner", "m")
+    lower: Float[Array, "..."] = quantity("lower corner", "m", kind="place")
+    upper: Float[Array, "..."] = quantity("upper corner", "m", kind="place")
 
     def __check_init__(self):
         lower, upper = concrete(self.lower), concrete(self.upper)
         if lower is not None and upper is not None:
             demand("upper corner [m]", self.upper, upper > lower, f"above the lower corner {lower} in every component")
+
+    def relations(self) -> tuple[Array, ...]:
+        """What must hold between its numbers, also where they are traced."""
+        return (self.upper > self.lower,)
 
     def walls(self) -> tuple[Slab, ...]:
         """A corridor along each axis, between two opposite walls."""

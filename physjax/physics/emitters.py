@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from physjax.checks import concrete, demand, demand_direction, positive_integer, quantity
+from physjax.checks import concrete, declared, demand, demand_direction, positive_integer, quantity
 from physjax.lanes import on_runs
 from physjax.particles import Particles, demand_particles
 from physjax.physics.looks import Appearance, Look
@@ -68,26 +68,32 @@ class Emitter(eqx.Module):
 
     pool: int = eqx.field(static=True, converter=lambda value: positive_integer("pool", value))
     source: Source
-    key: UInt32[Array, "words"] = eqx.field(converter=lambda key: _key_data(key), kw_only=True)
-    life: Float[Array, ""] = quantity("life", "s", above=0, kw_only=True)
-    speed: Float[Array, ""] = quantity("speed", "m/s", default=0.0, kw_only=True)
-    rate: Float[Array, ""] | None = quantity("rate", "1/s", above=0, default=None, kw_only=True)
-    every: Float[Array, ""] | None = quantity("time between bursts", "s", above=0, default=None, kw_only=True)
+    key: UInt32[Array, "words"] = declared("key", per=None, converter=lambda key: _key_data(key), kw_only=True)
+    life: Float[Array, ""] = quantity("life", "s", per=None, above=0, kw_only=True)
+    speed: Float[Array, ""] = quantity("speed", "m/s", per=None, default=0.0, kw_only=True)
+    rate: Float[Array, ""] | None = quantity("rate", "1/s", per=None, above=0, default=None, kw_only=True)
+    every: Float[Array, ""] | None = quantity("time between bursts", "s", per=None, above=0, default=None, kw_only=True)
     burst: int | None = eqx.field(static=True, default=None, kw_only=True)
-    start: Float[Array, ""] = quantity("start", "s", default=0.0, kw_only=True)
-    direction: Float[Array, "dim"] | None = quantity("direction", "1", default=None, kw_only=True)
-    cone: Float[Array, ""] = quantity("half-angle of the cone", "rad", at_least=0, default=0.0, kw_only=True)
-    size: Float[Array, ""] = quantity("size", "m", above=0, default=0.01, kw_only=True)
-    speed_spread: Float[Array, ""] = quantity("spread of the speed", "1", at_least=0, default=0.0, kw_only=True)
-    life_spread: Float[Array, ""] = quantity("spread of the life", "1", at_least=0, default=0.0, kw_only=True)
-    size_spread: Float[Array, ""] = quantity("spread of the size", "1", at_least=0, default=0.0, kw_only=True)
+    start: Float[Array, ""] = quantity("start", "s", per=None, default=0.0, kw_only=True)
+    direction: Float[Array, "dim"] | None = quantity(
+        "direction", "1", kind="vector", per=None, default=None, kw_only=True
+    )
+    cone: Float[Array, ""] = quantity(
+        "half-angle of the cone", "rad", per=None, at_least=0, at_most=3.1416, default=0.0, kw_only=True
+    )
+    size: Float[Array, ""] = quantity("size", "m", per=None, above=0, default=0.01, kw_only=True)
+    speed_spread: Float[Array, ""] = quantity(
+        "spread of the speed", "1", per=None, at_least=0, default=0.0, kw_only=True
+    )
+    life_spread: Float[Array, ""] = quantity("spread of the life", "1", per=None, at_least=0, default=0.0, kw_only=True)
+    size_spread: Float[Array, ""] = quantity("spread of the size", "1", per=None, at_least=0, default=0.0, kw_only=True)
     look: Look = eqx.field(default_factory=Look, kw_only=True)
     opposed: bool = eqx.field(static=True, default=False, kw_only=True)
     drop_oldest: bool = eqx.field(static=True, default=False, kw_only=True)
-    slot: Int[Array, "pool"] | None = eqx.field(default=None, kw_only=True)
-    generation: Int[Array, "..."] | None = eqx.field(default=None, kw_only=True)
-    born: Float[Array, "..."] | None = eqx.field(default=None, kw_only=True)
-    dies: Float[Array, "..."] | None = eqx.field(default=None, kw_only=True)
+    slot: Int[Array, "pool"] | None = declared("slot", per="memory", default=None, kw_only=True)
+    generation: Int[Array, "..."] | None = declared("generation", per="memory", default=None, kw_only=True)
+    born: Float[Array, "..."] | None = declared("birth", "s", per="memory", default=None, kw_only=True)
+    dies: Float[Array, "..."] | None = declared("death", "s", per="memory", default=None, kw_only=True)
 
     def __post_init__(self):
         # an array of its own, so that lanes that are taken apart keep their numbers
@@ -106,12 +112,14 @@ class Emitter(eqx.Module):
         for name, value in (("life", self.life_spread), ("size", self.size_spread)):
             if concrete(value) is not None:
                 demand(f"spread of the {name} [1]", value, concrete(value) < 1, "numbers from 0 to below 1")
-        if concrete(self.cone) is not None:
-            demand("half-angle of the cone [rad]", self.cone, concrete(self.cone) <= 3.1416, "numbers from 0 to π")
         if self.direction is not None:
             demand_direction("direction", self.direction)
         if not self.drop_oldest:
             self._demand_room()
+
+    def relations(self) -> tuple[Array, ...]:
+        """What must hold between its numbers, also where they are traced."""
+        return self.life_spread < 1, self.size_spread < 1
 
     def _demand_room(self):
         """Raise a ValueError where a slot is needed again before its particle has died."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import positive_integer, quantity
+from physjax.checks import declared, positive_integer, quantity
 from physjax.scene import Field, Force, Particles
 from physjax.vectors import components, cross, dot, norm, over, scale, stacked, turn_left, unit
 
@@ -55,11 +55,11 @@ class Turbulence(Flow):
     """
 
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
-    speed: Float[Array, ""] = quantity("speed of the eddies", "m/s", at_least=0)
-    size: Float[Array, ""] = quantity("size of the eddies", "m", above=0)
-    waves: Float[Array, "modes dim"]
-    swings: Float[Array, "modes dim"]
-    phases: Float[Array, "modes"]
+    speed: Float[Array, ""] = quantity("speed of the eddies", "m/s", per=None, at_least=0)
+    size: Float[Array, ""] = quantity("size of the eddies", "m", per=None, above=0)
+    waves: Float[Array, "modes dim"] = declared("wave vectors", "1/m", per=None)
+    swings: Float[Array, "modes dim"] = declared("amplitudes", per=None)
+    phases: Float[Array, "modes"] = declared("phases", "rad", per=None)
 
     def __init__(
         self, coefficient: ArrayLike, speed: ArrayLike, size: ArrayLike, *, key: Any, dim: int = 3, modes: int = 8
@@ -102,8 +102,8 @@ class Vortex(Flow):
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
     circulation: Float[Array, "..."] = quantity("circulation", "m²/s")
     core: Float[Array, "..."] = quantity("radius of the core", "m", above=0)
-    center: Float[Array, "..."] = quantity("center of the vortex", "m")
-    axis: Float[Array, "..."] | None = quantity("axis of the vortex", "1", default=None)
+    center: Float[Array, "..."] = quantity("center of the vortex", "m", kind="place")
+    axis: Float[Array, "..."] | None = quantity("axis of the vortex", "1", kind="vector", default=None)
 
     def __check_init__(self):
         if (self.axis is None) != (self.center.shape[-1:] == (2,)):
@@ -136,7 +136,7 @@ class Attractor(Field):
 
     strength: Float[Array, "..."] = quantity("strength μ", "m³/s²")
     softening: Float[Array, "..."] = quantity("softening", "m", above=0)
-    center: Float[Array, "..."] = quantity("center of the attractor", "m")
+    center: Float[Array, "..."] = quantity("center of the attractor", "m", kind="place")
 
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-μ d/(d² + ε²)^(3/2) [m/s²]."""

@@ -8,16 +8,16 @@ import math
 from collections.abc import Callable
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity
+from physjax.checks import declared, quantity
 from physjax.physics.gravitation import Gravitation
 from physjax.physics.timed import Constant, Control, Kick, per_lane, share_before
+from physjax.physics.weight import Buoyancy, Gravity
 from physjax.scene import Field, Force, Function, Particles, loads
-from physjax.vectors import dot, norm, over, scale, spin, unit, upward
+from physjax.vectors import dot, norm, over, scale, spin, unit
 
 __all__ = [
     "Anchor",
@@ -38,27 +38,6 @@ __all__ = [
 ]
 
 
-class Gravity(Field):
-    """Weight near the ground: F = m g, down the axis `up` (1: y). The lecture prints g = -9.8; here g > 0 and up is up.
-
-    Example:
-        >>> print(forces.Gravity()(0.0, ball, shot.mass))
-        [ -0.  -19.6]
-    """
-
-    definite: ClassVar[bool] = True
-    g: Float[Array, "..."] = quantity("g", "m/s²", default=9.8)
-    up: int = eqx.field(static=True, default=1)
-
-    def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """-g along the upward axis [m/s²]."""
-        return upward(-self.g, self.up, state.velocity)
-
-    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
-        """m g y [J]."""
-        return mass * self.g * state.position[..., self.up]
-
-
 class Blast(Force):
     """An explosion: away from the `center`, impulse J/(1 + (d/r)²) [N s] at the distance d, spread over a `duration` [s].
 
@@ -72,7 +51,7 @@ class Blast(Force):
         [0. 4.]
     """
 
-    center: Float[Array, "..."] = quantity("center of the blast", "m")
+    center: Float[Array, "..."] = quantity("center of the blast", "m", kind="place")
     impulse: Float[Array, "..."] = quantity("impulse", "N s")
     reach: Float[Array, "..."] = quantity("reach of the blast", "m", above=0)
     at: Float[Array, "..."] = quantity("start of the blast", "s")
@@ -104,7 +83,7 @@ class _SteadyBlast(Force):
     """A blast that lasts: so many of its impulses a second."""
 
     blast: Blast
-    rate: Float[Array, "..."]
+    rate: Float[Array, "..."] = declared("blasts a second", "1/s", per="memory")
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         return scale(self.rate, self.blast.received(state))
@@ -122,7 +101,7 @@ class StokesDrag(Force):
 
     definite: ClassVar[bool] = True
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
 
     @classmethod
     def of_sphere(
@@ -148,7 +127,7 @@ class QuadraticDrag(Force):
     area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
     coefficient: Float[Array, "..."] = quantity("drag coefficient C_d", "1", at_least=0)
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-½ρC_dA |v - wind| (v - wind) [N]."""
@@ -174,7 +153,7 @@ class SphereDrag(Force):
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", above=0, default=1.204)
     viscosity: Float[Array, "..."] = quantity("viscosity", "Pa s", above=0, default=1.81e-5)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The corrected Stokes force [N]."""
@@ -198,66 +177,15 @@ class Magnus(Force):
 
     area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
     coefficient: Float[Array, "..."] = quantity("lift coefficient C_L", "1", at_least=0)
-    axis: Float[Array, "..."] = quantity("spin axis", "1")
+    axis: Float[Array, "..."] = quantity("spin axis", "1", kind="axial")
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", default=None)
+    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """½ρAC_L |v| ω̂×v [N], v relative to the wind."""
         v = _airspeed(state, self.wind)
         axis = jnp.sign(self.axis) if v.shape[-1] == 2 else unit(over(self.axis, v))
         return scale(0.5 * self.density * self.coefficient * self.area * norm(v), spin(axis, v))
-
-
-class Buoyancy(Force):
-    """Archimedes: F = ρ_f V g, upward (the lecture prints a minus sign). V is the volume of fluid displaced.
-
-    Immersed: give `volume` [m³]. A ball that crosses the fluid's surface: give its `radius` [m] and the height
-    `surface` [m] of the fluid; the part below it counts, V = πh²(3r - h)/3 for a submerged depth h.
-
-    Example:
-        >>> print(forces.Buoyancy(density=1000.0, volume=0.002)(0.0, ball, shot.mass))
-        [ 0.  19.6]
-    """
-
-    definite: ClassVar[bool] = True
-    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0)
-    volume: Float[Array, "..."] | None = quantity("volume", "m³", at_least=0, default=None)
-    radius: Float[Array, "..."] | None = quantity("radius", "m", above=0, default=None)
-    surface: Float[Array, "..."] | None = quantity("surface of the fluid", "m", default=None)
-    g: Float[Array, "..."] = quantity("g", "m/s²", default=9.8)
-    up: int = eqx.field(static=True, default=1)
-
-    def __check_init__(self):
-        given = (self.volume is not None, self.radius is not None, self.surface is not None)
-        if given not in ((True, False, False), (False, True, True)):
-            raise ValueError(
-                "Buoyancy: expected volume= (immersed), or radius= and surface= (a ball that crosses the surface); got "
-                f"{[n for n, g in zip(('volume', 'radius', 'surface'), given, strict=True) if g] or 'none of them'}."
-            )
-
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """ρ_f V g along the upward axis [N]."""
-        return upward(self.density * self.g * self.displaced(state), self.up, state.velocity)
-
-    def displaced(self, state: Particles) -> Float[Array, "..."]:
-        """Volume below the surface [m³]."""
-        if self.surface is None:
-            return self.volume
-        h = jnp.minimum(self._depth(state), 2 * self.radius)
-        return math.pi / 3 * h**2 * (3 * self.radius - h)
-
-    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
-        """Energy of the displaced fluid [J]: minus the work of the buoyant force from the surface (or from y = 0) to here."""
-        if self.surface is None:
-            return -self.density * self.g * self.volume * state.position[..., self.up]
-        depth, r = self._depth(state), self.radius
-        h = jnp.minimum(depth, 2 * r)
-        return self.density * self.g * math.pi / 3 * (r * h**3 - h**4 / 4 + 4 * r**3 * (depth - h))
-
-    def _depth(self, state):
-        """Depth of the ball's lowest point."""
-        return jnp.maximum(self.surface - state.position[..., self.up] + self.radius, 0.0)
 
 
 class RotatingFrame(Field):
@@ -271,8 +199,8 @@ class RotatingFrame(Field):
         [16.  8.]
     """
 
-    omega: Float[Array, "..."] = quantity("omega", "rad/s")
-    omega_rate: Float[Array, "..."] | None = quantity("omega_rate", "rad/s²", default=None)
+    omega: Float[Array, "..."] = quantity("omega", "rad/s", kind="axial")
+    omega_rate: Float[Array, "..."] | None = quantity("omega_rate", "rad/s²", kind="axial", default=None)
 
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-ω×(ω×r) - 2ω×v - ω̇×r [m/s²]."""
@@ -295,7 +223,7 @@ class Anchor(Force):
         [  5. -10.]
     """
 
-    point: Float[Array, "..."] = quantity("anchor point", "m")
+    point: Float[Array, "..."] = quantity("anchor point", "m", kind="place")
     stiffness: Float[Array, "..."] = quantity("stiffness", "N/m", at_least=0)
     rest_length: Float[Array, "..."] | None = quantity("rest length", "m", at_least=0, default=None)
     damping: Float[Array, "..."] | None = quantity("damping", "kg/s", at_least=0, default=None)

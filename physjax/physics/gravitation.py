@@ -30,8 +30,8 @@ class Gravitation(Field):
     """
 
     couples: ClassVar[bool] = True
-    G: Float[Array, ""] = quantity("G", "m³/kg/s²", default=6.67430e-11)
-    softening: Float[Array, ""] | None = quantity("softening", "m", at_least=0, default=None)
+    G: Float[Array, ""] = quantity("G", "m³/kg/s²", per=None, default=6.67430e-11)
+    softening: Float[Array, ""] | None = quantity("softening", "m", per=None, at_least=0, default=None)
     gm: Float[Array, "..."] | None = quantity("gm", "m³/s²", at_least=0, default=None)
 
     def acceleration(

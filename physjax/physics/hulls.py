@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import demand_legal, real_quantity
+from physjax.checks import declared, demand_legal, real_quantity
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_velocity, in_world
 from physjax.physics.collide import Felt, collide
@@ -39,8 +39,8 @@ class Hull(eqx.Module):
         (8, 3)
     """
 
-    points: Float[Array, "*lanes points 3"]
-    radius: Float[Array, "..."]
+    points: Float[Array, "*lanes points 3"] = declared("points of the hull", "m", kind="place", per="point")
+    radius: Float[Array, "..."] = declared("radius of the hull", "m", at_least=0)
 
     def __init__(self, points: Any, radius: Any = 0.0):
         self.points = real_quantity("points of the hull [m]", points)

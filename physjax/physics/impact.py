@@ -20,7 +20,7 @@ from physjax.lanes import any_lane, apart, on_flagged
 from physjax.physics.holding import Held, carried, hold, nothing_held
 from physjax.physics.rebound import rebound
 from physjax.roots import first_root
-from physjax.scene import Function, Particles, Scene, traced_once
+from physjax.scene import Particles, Scene, traced_once
 from physjax.vectors import dot
 
 IMPACTS = 8
@@ -58,9 +58,9 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
     meets = _may_meet(scene, since, end, t, dt)
     if scene.held is not None:
         meets = meets & ~scene.held
-    # a plain function may hold arrays of its own that cannot be cut, and a path is one of all lanes
-    cut = scene.led is None and not any(isinstance(force, Function) for force in scene.forces)
-    end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), meets, scene, t, dt, cut=cut)
+    others = (meets, scene, jnp.asarray(t), jnp.asarray(dt))
+    cut, masks = scene.may_be_cut(), scene.lane_mask(others)
+    end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), *others, masks=masks, cut=cut)
     return scene.having(state=end, contacts=_remembered(scene.contacts, list(since)))
 
 

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from numpy.linalg import eigh
 
-from physjax.checks import concrete, demand, real_quantity
+from physjax.checks import concrete, declared, demand, real_quantity
 from physjax.physics.meshes import checked_mesh
 from physjax.vectors import components, dot, scale
 
@@ -30,11 +30,11 @@ class Inertia(eqx.Module):
         [13.0, 10.0, 5.0]
     """
 
-    mass: Float[Array, "..."]
-    principal: Float[Array, "*lanes 3"]
-    axes: Float[Array, "*lanes 4"] | None
-    arm: Float[Array, "*lanes 3"] | None
-    pivot: Float[Array, "*lanes 3"] | None
+    mass: Float[Array, "..."] = declared("mass", "kg", above=0)
+    principal: Float[Array, "*lanes 3"] = declared("principal moments", "kg m²", kind="vector", at_least=0)
+    axes: Float[Array, "*lanes 4"] | None = declared("axes", kind="rotation")
+    arm: Float[Array, "*lanes 3"] | None = declared("arm of the pivot", "m", kind="vector")
+    pivot: Float[Array, "*lanes 3"] | None = declared("pivot", "m", kind="place")
 
     def __init__(self, mass: Any, principal: Any, axes: Any = None):
         self.mass = real_quantity("mass [kg]", mass, above=0.0)

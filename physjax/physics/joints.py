@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity, real_quantity
+from physjax.checks import declared, quantity, real_quantity
 from physjax.physics.bodies import Load, RigidBodies, Wrench, angular_velocity, in_world
 from physjax.physics.inertia import Inertia
 from physjax.vectors import cross, dot, norm, scale
@@ -29,10 +29,10 @@ class Joints(Load):
     """
 
     couples: ClassVar[bool] = True
-    points: Float[Array, "joints 2 3"]
+    points: Float[Array, "joints 2 3"] = declared("points of the joints", "m", kind="place", per=None)
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", above=0)
-    damping: Float[Array, "..."] = quantity("damping c", "kg/s", at_least=0)
+    stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", per="joint", above=0)
+    damping: Float[Array, "..."] = quantity("damping c", "kg/s", per="joint", at_least=0)
 
     def __init__(self, pairs: Any, points: Any, stiffness: Any, damping: Any = 0.0):
         pairs = np.asarray(pairs)

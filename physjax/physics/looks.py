@@ -35,9 +35,11 @@ class Look(eqx.Module):
         [1.0, 0.0]
     """
 
-    size: Float[Array, "knots"] = quantity("size over life", "1", at_least=0, default=(1.0, 1.0))
-    colour: Float[Array, "knots 3"] = quantity("colour over life", "1", at_least=0, default=((0.2, 0.4, 0.7),) * 2)
-    opacity: Float[Array, "knots"] = quantity("opacity over life", "1", at_least=0, default=(1.0, 1.0))
+    size: Float[Array, "knots"] = quantity("size over life", "1", per=None, at_least=0, default=(1.0, 1.0))
+    colour: Float[Array, "knots 3"] = quantity(
+        "colour over life", "1", per=None, at_least=0, default=((0.2, 0.4, 0.7),) * 2
+    )
+    opacity: Float[Array, "knots"] = quantity("opacity over life", "1", per=None, at_least=0, default=(1.0, 1.0))
     glows: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):

@@ -29,6 +29,10 @@ class Coulomb(eqx.Module):
         if static is not None and kinetic is not None:
             demand("kinetic friction μ_k [1]", self.kinetic, kinetic <= static, f"at most the static μ_s = {static}")
 
+    def relations(self) -> tuple[Array, ...]:
+        """What must hold between its numbers, also where they are traced."""
+        return (self.kinetic <= self.static,)
+
 
 def rebound(
     surface: eqx.Module,

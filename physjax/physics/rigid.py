@@ -148,7 +148,7 @@ class Torque(Load):
         [0. 0. 5.]
     """
 
-    torque: Float[Array, "..."] = quantity("torque", "N m")
+    torque: Float[Array, "..."] = quantity("torque", "N m", kind="vector")
     frame: str = eqx.field(static=True, default="world")
 
     def __check_init__(self):
@@ -185,8 +185,8 @@ class Thrust(Load):
         [3. 0. 0.] [ 0.  0. -6.]
     """
 
-    force: Float[Array, "..."] = quantity("thrust", "N")
-    point: Float[Array, "..."] = quantity("point of the body", "m", default=(0.0, 0.0, 0.0))
+    force: Float[Array, "..."] = quantity("thrust", "N", kind="vector")
+    point: Float[Array, "..."] = quantity("point of the body", "m", kind="place", default=(0.0, 0.0, 0.0))
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
@@ -207,7 +207,7 @@ class AtPoint(Load):
         [ 0.  0. -6.]
     """
 
-    point: Float[Array, "..."] = quantity("point of the body", "m")
+    point: Float[Array, "..."] = quantity("point of the body", "m", kind="place")
     force: Force = eqx.field(converter=as_module)
 
     def __check_init__(self):

@@ -46,7 +46,7 @@ class Point(Source):
         [1. 2.]
     """
 
-    at: Float[Array, "dim"] = quantity("place of the source", "m")
+    at: Float[Array, "dim"] = quantity("place of the source", "m", kind="place", per=None)
 
     @property
     def dim(self) -> int:
@@ -69,9 +69,9 @@ class Disc(Source):
         1.0 [0. 0. 1.]
     """
 
-    center: Float[Array, "dim"] = quantity("center of the disc", "m")
-    normal: Float[Array, "dim"] = quantity("normal of the disc", "1")
-    radius: Float[Array, ""] = quantity("radius of the disc", "m", at_least=0)
+    center: Float[Array, "dim"] = quantity("center of the disc", "m", kind="place", per=None)
+    normal: Float[Array, "dim"] = quantity("normal of the disc", "1", kind="vector", per=None)
+    radius: Float[Array, ""] = quantity("radius of the disc", "m", per=None, at_least=0)
 
     def __check_init__(self):
         demand_direction("normal of the disc", self.normal)
@@ -100,8 +100,8 @@ class Box(Source):
         [1. 1.]
     """
 
-    lower: Float[Array, "dim"] = quantity("lower corner", "m")
-    upper: Float[Array, "dim"] = quantity("upper corner", "m")
+    lower: Float[Array, "dim"] = quantity("lower corner", "m", kind="place", per=None)
+    upper: Float[Array, "dim"] = quantity("upper corner", "m", kind="place", per=None)
 
     def __check_init__(self):
         lower, upper = concrete(self.lower), concrete(self.upper)
@@ -132,8 +132,8 @@ class Sphere(Source):
         [2. 2. 2.]
     """
 
-    center: Float[Array, "dim"] = quantity("center", "m")
-    radius: Float[Array, ""] = quantity("radius", "m", at_least=0)
+    center: Float[Array, "dim"] = quantity("center", "m", kind="place", per=None)
+    radius: Float[Array, ""] = quantity("radius", "m", per=None, at_least=0)
     shell: bool = eqx.field(static=True, default=False)
 
     @property

@@ -9,7 +9,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import declared, positive_integer, real_quantity
 from physjax.physics.networks import Network
 from physjax.physics.tangents import SpringsTangent, product, tangent_numbers
 from physjax.scene import Force, Particles
@@ -36,11 +36,11 @@ class Springs(Force):
     couples: ClassVar[bool] = True
     definite: ClassVar[bool] = True
     network: Network = eqx.field(static=True)
-    k: Float[Array, "..."]
-    L: Float[Array, "..."]
-    c: Float[Array, "..."] | None
-    limit: Float[Array, "..."] | None
-    intact: Bool[Array, "..."] | None
+    k: Float[Array, "..."] = declared("stiffness", "N/m", per="spring", at_least=0)
+    L: Float[Array, "..."] = declared("rest length", "m", per="spring", at_least=0)
+    c: Float[Array, "..."] | None = declared("damping", "kg/s", per="spring", at_least=0)
+    limit: Float[Array, "..."] | None = declared("breaks_at", per="spring", at_least=0)
+    intact: Bool[Array, "..."] | None = declared("unbroken", per="spring")
 
     def __init__(
         self,

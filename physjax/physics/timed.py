@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity
+from physjax.checks import declared, quantity
 from physjax.scene import Force, Particles
 from physjax.vectors import dot, over, scale
 
@@ -21,7 +21,7 @@ class Constant(Force):
     """
 
     definite: ClassVar[bool] = True
-    force: Float[Array, "..."] = quantity("force", "N")
+    force: Float[Array, "..."] = quantity("force", "N", kind="vector")
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """F₀ [N]."""
@@ -44,7 +44,7 @@ class Kick(Force):
         [12.  0.] [0. 0.]
     """
 
-    impulse: Float[Array, "..."] = quantity("impulse", "N s")
+    impulse: Float[Array, "..."] = quantity("impulse", "N s", kind="vector")
     at: Float[Array, "..."] = quantity("start of the kick", "s")
     duration: Float[Array, "..."] = quantity("duration of the kick", "s", above=0)
 
@@ -81,7 +81,7 @@ class Control(Force):
     """
 
     definite: ClassVar[bool] = True
-    values: Float[Array, "*lanes pieces dim"] = quantity("force over time", "N")
+    values: Float[Array, "*lanes pieces dim"] = quantity("force over time", "N", kind="vector", per="table")
     duration: Float[Array, "..."] = quantity("duration", "s", above=0)
     at: Float[Array, "..."] = quantity("start", "s", default=0.0)
     linear: bool = eqx.field(static=True, default=False)
@@ -147,7 +147,7 @@ class _Ramp(Force):
 
     definite: ClassVar[bool] = True
     control: Control
-    share: Float[Array, "..."]
+    share: Float[Array, "..."] = declared("share of the step", per="memory")
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         return scale(self.share, self.control._between(t, state))

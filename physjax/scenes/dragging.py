@@ -47,8 +47,8 @@ class Lead(Force):
     """A damped spring to a place that sets out softly: F = k (X - x) + c (X' - v), X = X₀ + U (t - τ(1 - e^(-t/τ)))."""
 
     couples: ClassVar[bool] = False
-    start: Float[Array, "..."] = quantity("place at t = 0", "m")
-    velocity: Float[Array, "..."] = quantity("velocity of the place in the end", "m/s")
+    start: Float[Array, "..."] = quantity("place at t = 0", "m", kind="place")
+    velocity: Float[Array, "..."] = quantity("velocity of the place in the end", "m/s", kind="vector")
     soft: Float[Array, "..."] = quantity("time τ to set out in", "s", above=0)
     stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", at_least=0)
     damping: Float[Array, "..."] = quantity("damping c", "kg/s", at_least=0)

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from physjax.lanes import is_per_lane
-from physjax.scene import Scene, plain_functions
+from physjax.scene import Scene
 
 BLOCK = 8192
 """Lanes in a block: 200 kB of state in 3-D and float32, which leaves room for the stages of a step in a 1 MB cache."""
@@ -34,35 +33,31 @@ class Blocks(NamedTuple):
     def of(cls, scene: Scene, moving: Any, frame_steps: int) -> "Blocks | None":
         """The blocks for a scene, or None where they would not pay or could change its meaning.
 
-        Lanes that are coupled stay together, and so do those of a plain function or a path, which may hold arrays that
-        cannot be cut, and those that share something that changes: `moving` are the arrays that a step changes.
+        Lanes stay together where the scene may not be cut, and where they share something that changes: `moving` are the
+        arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)
-        whole = scene.couples or scene.led is not None or bool(plain_functions(scene.forces))
-        if whole or total < SMALLEST or frame_steps < FEWEST_STEPS or jax.default_backend() != "cpu":
+        if total < SMALLEST or frame_steps < FEWEST_STEPS or jax.default_backend() != "cpu" or not scene.may_be_cut():
             return None
         count = math.ceil(total / BLOCK)
         blocks = cls(scene.state.lanes, math.ceil(total / count), count)
-        return blocks if all(map(blocks.is_cut, jax.tree.leaves(moving))) else None
-
-    def is_cut(self, leaf: Any) -> bool:
-        """Whether an array has an entry for each lane."""
-        return is_per_lane(leaf, self.lanes)
+        return blocks if all(jax.tree.leaves(scene.lane_mask(moving))) else None
 
     def cut(self, tree: Any) -> Any:
-        """Per-lane arrays as `(count, size, ...)`, other leaves as they are."""
-        return jax.tree.map(lambda leaf: self._cut(leaf) if self.is_cut(leaf) else leaf, tree)
+        """Trees of per-lane arrays as `(count, size, ...)`."""
+        return jax.tree.map(self._cut, tree)
 
-    def join(self, tree: Any, like: Any, leading: int = 0) -> Any:
-        """Undo `cut`, behind `leading` further axes; `like` is the tree before cutting."""
-        return jax.tree.map(lambda leaf, was: self._join(leaf, leading) if self.is_cut(was) else leaf, tree, like)
+    def join(self, tree: Any, leading: int = 0) -> Any:
+        """Undo `cut`, behind `leading` further axes."""
+        return jax.tree.map(lambda leaf: self._join(leaf, leading), tree)
 
-    def map(self, function: Callable, blocked: Any, *others: Any) -> Any:
-        """`function(block, *others)` for each block in turn; `others` are uncut trees, of which it sees the block's part."""
-        cut = [jax.tree.map(self.is_cut, other) for other in others]
-        parts = [
-            jax.tree.map(lambda leaf, c: self._cut(leaf) if c else None, o, c) for o, c in zip(others, cut, strict=True)
-        ]
+    def map(self, function: Callable, blocked: Any, *others: Any, masks: Any) -> Any:
+        """`function(block, *others)` for each block in turn; `others` are uncut trees, of which it sees the block's part.
+
+        `masks` say which of their arrays have an entry for each lane.
+        """
+        cut = lambda leaf, has_lanes: self._cut(leaf) if has_lanes else None  # noqa: E731
+        parts = [jax.tree.map(cut, other, mask) for other, mask in zip(others, masks, strict=True)]
 
         def one(slices):
             block, *lanes = slices

@@ -90,14 +90,15 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
             moving = repeat(partial(step, still=still, dt=dt), moving, first, save_every)
         else:
             moving = blocks.map(
-                lambda m, s, h: repeat(partial(step, still=s, dt=h), m, first, save_every), moving, still, dt
-            )
+                lambda m, s, h: repeat(partial(step, still=s, dt=h), m, first, save_every),
+                moving, still, dt, masks=scene.lane_mask((still, dt)),
+            )  # fmt: skip
         return moving, moving if record is None else record(clock(first + save_every), eqx.combine(moving, still).state)
 
     start = moving if blocks is None else blocks.cut(moving)
     last, kept = lax.scan(frame, start, jnp.arange(frames, dtype=jnp.int32))
     if blocks is not None:
-        last, kept = blocks.join(last, moving), blocks.join(kept, moving, leading=1)
+        last, kept = blocks.join(last), blocks.join(kept, leading=1)
     first_kept = moving if record is None else record(clock(first_step), scene.state)
     kept = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first_kept, kept)
     film = None if record is not None else eqx.combine(kept, still)
@@ -199,8 +200,8 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
         >>> int(end.steps), round(float(end.dt), 4)
         (3, 0.3333)
     """
-    duration = real_quantity("duration [s]", duration, above=0.0).astype(scene.state.dtype)
-    dt = real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype)
+    duration = _forward(real_quantity("duration [s]", duration, above=0.0).astype(scene.state.dtype))
+    dt = _forward(real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
     if duration.shape or dt.shape:
         raise ValueError(f"state_after: got shapes {duration.shape} and {dt.shape}, expected one duration and one dt.")
     steps = jnp.maximum(1, jnp.round(duration / dt)).astype(jnp.int32)
@@ -229,13 +230,18 @@ def _changing(scene: Scene, dt: ArrayLike) -> Any:
 
 
 def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:
-    dt = real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype)
+    dt = _forward(real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
     if dt.shape not in ((), scene.status_shape):
         raise ValueError(
             f"dt [s]: got shape {dt.shape}, expected () or {scene.status_shape}: one step size per "
             f"{'scene, since lanes are coupled' if scene.couples else 'lane'}."
         )
     return dt
+
+
+def _forward(duration: Array) -> Array:
+    """A duration [s], NaN where it is traced and not > 0: then the run's status says so."""
+    return jnp.where(duration > 0, duration, jnp.nan) if isinstance(duration, jax.core.Tracer) else duration
 
 
 def _checked_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> int:

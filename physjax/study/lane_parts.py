@@ -1,17 +1,10 @@
 """A scene with other lanes: every array that has an entry for each is cut to those that stay."""
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
 from functools import partial
-from typing import Any
 
-import jax
-import numpy as np
-
-from physjax.lanes import is_per_lane
-from physjax.physics.springs import Springs
+from physjax.quantities import select_lanes
 from physjax.scene import Scene
-from physjax.study.flattening import vectors_of
 
 
 def one_lane(scene: Scene, lane: int | tuple[int, ...]) -> Scene:
@@ -33,29 +26,8 @@ def with_lanes(scene: Scene, shape: tuple[int, ...], cut: Callable) -> Scene:
         raise ValueError(
             "lanes: got a scene with an emitter, expected lanes that live from the start: births fill its whole pool."
         )
-    parts = [_part(part, shape, cut) for part in (*scene.forces, *scene.contacts)]
+    select = partial(select_lanes, lanes=shape, dim=scene.state.position.shape[-1], cut=cut)
+    parts = [select(part) for part in (*scene.forces, *scene.contacts)]
     count = len(scene.forces)
-    numbers = partial(_cut, cut, shape, False)
-    state = jax.tree.map(partial(_cut, cut, shape, True), scene.state)
-    pinned = jax.tree.map(numbers, scene.pinned)
-    return Scene(state, jax.tree.map(numbers, scene.mass), parts[:count], parts[count:], pinned)
-
-
-def _part(part: Any, shape: tuple[int, ...], cut: Callable) -> Any:
-    """A force or contact for other lanes; a contact forgets, since its memory belongs to a scene."""
-    if isinstance(part, Springs) or not is_dataclass(part):
-        return jax.tree.map(partial(_cut, cut, shape, False), part)
-    vectors = vectors_of(part)
-    changes = {
-        f.name: jax.tree.map(partial(_cut, cut, shape, f.name in vectors), getattr(part, f.name))
-        for f in fields(part)
-        if f.init
-    }
-    if "touching_since" in changes:
-        changes["touching_since"] = None
-    return replace(part, **changes)
-
-
-def _cut(cut: Callable, shape: tuple[int, ...], vector: bool, leaf: Any) -> Any:
-    """One vector for all has no entry for each lane, though it may have as many components as there are lanes."""
-    return cut(leaf) if is_per_lane(leaf, shape) and np.ndim(leaf) >= len(shape) + vector else leaf
+    pinned = select(scene.pinned)
+    return Scene(select(scene.state), select(scene.mass), parts[:count], parts[count:], pinned)

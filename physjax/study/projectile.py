@@ -19,10 +19,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, real_array, real_quantity
+from physjax.checks import concrete, demand, real_array, real_quantity
 from physjax.vectors import norm
 
 __all__ = [
@@ -43,6 +44,9 @@ __all__ = [
 
 ROUNDING = 8
 """A target beyond reach by no more than so many roundings counts as being on the edge."""
+
+TURN = 2 * math.pi * (1 + 1e-6)
+"""A full turn [rad], in any precision: an angle beyond it was meant in degrees."""
 
 _UNITS = {"t": "s", "speed": "m/s", "angle": "rad", "g": "m/s²"}
 
@@ -270,7 +274,12 @@ def _numbers(**given: ArrayLike) -> tuple[Array, ...]:
 def _number(name: str, value: ArrayLike) -> Array:
     label = f"{name} [{_UNITS.get(name, 'm')}]"
     if name in ("angle", "t"):
-        return real_array(label, value)
+        array = real_array(label, value)
+        values = concrete(array)
+        if name == "angle" and values is not None:
+            turns = np.isnan(values) | (np.abs(values) <= TURN)
+            demand(label, array, turns, "radians, at most a full turn; for degrees use np.deg2rad")
+        return array
     if name not in ("speed", "g"):
         return real_quantity(label, value)
     array = real_quantity(label, value, above=0)

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from physjax.lanes import any_lane, loop, on_flagged
-from physjax.scene import Function, Particles, Scene
+from physjax.scene import Particles, Scene
 from physjax.stepping.simulate import sample, simulate
 from physjax.trajectory import Trajectory
 from physjax.vectors import components, cross, dot, norm, scale, stacked, turn_left, unit
@@ -155,15 +155,15 @@ def _closer(
 
 def _repeated(closer: Callable, begin: Any, shots: Range, speed: Array | None, most: int) -> Any:
     """`closer(search, shots, speed)` again and again for the lanes that are `going`: a few hard ones hold up no others."""
-    # a plain function may hold arrays of its own that cannot be cut
-    cut = not any(isinstance(force, Function) for force in shots.scene.forces)
+    others = (shots, speed)
+    cut, masks = shots.scene.may_be_cut(), shots.scene.lane_mask(others)
 
     def once(search, shots, speed):
         after = closer(search, shots, speed)
         return chosen(search.going, after, search)
 
     def body(search):
-        return on_flagged(once, search.going, search, shots, speed, cut=cut)
+        return on_flagged(once, search.going, search, *others, masks=masks, cut=cut)
 
     return loop(lambda search: any_lane(search.going), body, begin, most=most)
 

@@ -372,5 +372,7 @@ def test_a_bad_number_is_answered_when_the_force_is_built(build, message, unanno
     ids=lambda force: type(force).__name__,
 )
 def test_a_number_or_a_short_vector_is_not_spread_over_space(force):
-    with pytest.raises(ValueError, match=r"got a vector of shape \(2?,?\), expected \(3,\) for all lanes or \(4, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"has the shape \(2?,?\), expected a vector of shape \(3,\) for all lanes or \(4, 3\)"
+    ):
         simulate(Scene(some_state(dim=3), forces=(force,)), methods.rk4, dt=0.1, steps=1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, forces, methods, simulate
+from physjax.checks import quantity
 from physjax.physics.forces import independent
 from physjax.stepping.blocks import FEWEST_STEPS, SMALLEST, Blocks
 from physjax.vectors import dot
@@ -40,7 +41,7 @@ class Stretchy(eqx.Module):
     """A spring to the origin that is stiffer in some directions, with a matrix of its own for each lane."""
 
     couples: ClassVar[bool] = False
-    stiffness: jax.Array
+    stiffness: jax.Array = quantity("stiffness", "N/m", kind="tensor")
 
     def __call__(self, t, state, mass):
         rows = jnp.moveaxis(self.stiffness, -2, 0)
