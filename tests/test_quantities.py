@@ -381,6 +381,8 @@ def test_one_bad_lane_among_traced_ones_harms_no_other():
     flight = run(drag)
     np.testing.assert_array_equal(flight.ok, [True, False, True])
     np.testing.assert_array_equal(flight.first_bad_step, [-1, 1, -1])
+    assert stability.explain(flight).cause == "input"
+    assert "a traced number beyond its bounds" in str(stability.explain(flight, lane=1))
     good = simulate(Scene(state, forces=(forces.StokesDrag(jnp.abs(drag)),)), methods.rk4, dt=0.1, steps=5)
     np.testing.assert_allclose(flight.position[-1, ::2], good.position[-1, ::2], rtol=1e-14)
 

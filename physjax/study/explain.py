@@ -32,9 +32,9 @@ class Explanation(NamedTuple):
     """What went wrong. Printed, it is a few sentences.
 
     `cause` is "stiffness", "damping", "resolution" (a motion too fast for dt, though bounded), "rounding" (positions so
-    large that a step is lost in their last digits), "error measure" (an adaptive method that looks at velocities alone)
-    or "nothing". `first_bad_step` (-1: the run stayed finite) and `node` say where; `limit` [s] is the step that was
-    too long, at time `t` [s]; `growth` a small deviation's growth in one step.
+    large that a step is lost in their last digits), "error measure" (an adaptive method that looks at velocities alone),
+    "input" (a traced number beyond its bounds) or "nothing". `first_bad_step` (-1: the run stayed finite) and `node` say
+    where; `limit` [s] is the step that was too long, at time `t` [s]; `growth` a small deviation's growth in one step.
 
     Example:
         >>> told = stability.explain(swing, methods.verlet, dt=1.25)
@@ -63,6 +63,7 @@ class Explanation(NamedTuple):
         why = {
             "rounding": "Positions are so large that a step is lost in their rounding.",
             "error measure": "The error looks at velocities alone and cannot see that positions are wrong.",
+            "input": "It starts non-finite: a traced number beyond its bounds, or a start on the wrong side of a contact.",
             "nothing": "Nothing was found wrong with the step.",
             "resolution": f"{self.force} moves things at |λ| = {abs(self.rate):.4g} 1/s at t = {self.t:.4g} s, too fast for dt.",
         }.get(self.cause) or (
@@ -92,6 +93,9 @@ def explain(
         >>> told.cause, round(told.limit, 3), round(told.growth, 3)
         ('stiffness', 1.0, 4.0)
     """
+    if isinstance(run, Trajectory) and run.scene is not None and not _starts_finite(run.scene, lane):
+        step, first = float(np.nanmin(np.asarray(run.dt))), int(run.first_step) + 1
+        return Explanation("input", "", None, 0j, 0.0, step, float("inf"), 1.0, first, (), (_INPUT_CURE,))
     if lane is not None:
         return explain(_alone(run, method, dt, steps, lane))
     if isinstance(run, Scene):
@@ -135,6 +139,17 @@ def explain(
             cause="resolution", force=fastest.force, rate=fastest.rate, t=t, limit=fastest.dt, cures=cures
         )
     return plain
+
+
+_INPUT_CURE = (
+    "build the scene with its numbers outside jit, vmap and sweep, where the error names the one that is wrong"
+)
+
+
+def _starts_finite(scene: Scene, lane: int | tuple[int, ...] | None) -> bool:
+    """Whether a scene, or one lane of it, starts with finite numbers."""
+    leaves = [np.asarray(leaf) if lane is None else np.asarray(leaf)[lane] for leaf in scene.state]
+    return all(np.isfinite(leaf).all() for leaf in leaves)
 
 
 def _alone(
