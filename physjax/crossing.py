@@ -38,13 +38,14 @@ class Crossing(NamedTuple):
 
 
 class Height(eqx.Module):
-    """All places at one height y [m], a number or one per lane; in one dimension that is the coordinate itself."""
+    """All places at one height [m] along the axis `up`, a number or one per lane; in one dimension the coordinate itself."""
 
     height: Float[Array, "..."] = quantity("height", "m")
+    up: int = eqx.field(static=True, default=1)
 
     def gap(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """How far above [m]."""
-        return position[..., min(1, position.shape[-1] - 1)] - self.height.astype(position.dtype)
+        return position[..., self.up] - self.height.astype(position.dtype)
 
 
 def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
@@ -55,7 +56,7 @@ def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
         )
     if not hasattr(surface, "gap"):
-        surface = as_module(surface) if callable(surface) else Height(surface)
+        surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 

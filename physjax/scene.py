@@ -219,6 +219,13 @@ class Scene(eqx.Module):
         return any(getattr(part, "couples", True) for part in (*self.forces, *self.contacts))
 
     @property
+    def up(self) -> int:
+        """The axis that points up: that of the weight, else of what else has an `up`, else y, of a line the only one."""
+        named = [part for part in self.forces if isinstance(getattr(part, "up", None), int)]
+        first = sorted(named, key=lambda part: not isinstance(part, Field))
+        return first[0].up if first else min(1, self.state.position.shape[-1] - 1)
+
+    @property
     def held(self) -> Bool[Array, "*lanes"] | None:
         """Mask of the lanes that no force moves, held where they are or led along a path; None where there are none."""
         return self.pinned if self.led is None else self.led.nodes

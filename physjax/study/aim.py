@@ -8,6 +8,7 @@ aimed.low.angle, aimed.high.angle, aimed.low.time, aimed.ok
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,7 +40,8 @@ class Shot(NamedTuple):
     """A launch and where it leads, for each target.
 
     `angle` is the elevation above the horizontal [rad], beyond a right angle for a shot back along x in the plane; in
-    space `azimuth` [rad] is its bearing from x towards z. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
+    space `azimuth` [rad] is its bearing from x towards z, where z is up from x towards y. Up is what the scene says
+    (`Scene.up`), y by default. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
     `apex`, the greatest height on the way [m]; `residual`, from the target to where the flight ends [m]. Where `ok` is
     False this is the nearest miss, or what something in the way makes of the shot, and its derivatives are zero.
     """
@@ -149,14 +151,17 @@ def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -
     else:
         free = Range(shots.scene.having(contacts=()), shots.target, shots.method, shots.steps)
         launch, legal = _implicit(free, speed, lambda: _searched(free, speed, late))
-    flight = shots.flight(launch, save_every=1, record=_height)
+    up = shots.scene.up
+    across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
+    flight = shots.flight(launch, save_every=1, record=_HEIGHTS[up])
     residual = flight.final_scene.state.position - shots.target
     ok = legal & (norm(residual) <= _tolerance(shots, launch))
     velocity, time = launch = _fixed_unless(ok, launch)
-    forward = velocity[..., 0] if velocity.shape[-1] == 2 else norm(velocity[..., ::2])
+    level = [velocity[..., axis] for axis in across]
+    forward = level[0] if len(level) == 1 else norm(jnp.stack(level, axis=-1))
     return Shot(
-        angle=jnp.arctan2(velocity[..., 1], forward),
-        azimuth=None if velocity.shape[-1] == 2 else jnp.arctan2(velocity[..., 2], velocity[..., 0]),
+        angle=jnp.arctan2(velocity[..., up], forward),
+        azimuth=None if len(level) == 1 else jnp.arctan2(level[1], level[0]),
         speed=norm(velocity) if speed is None else speed,
         time=time,
         velocity=velocity,
@@ -221,9 +226,13 @@ def _solved_by_lane(linear: Callable, b: Array) -> Array:
     return jnp.where(sound[..., None], jnp.linalg.solve(matrix, b[..., None])[..., 0], 0.0)
 
 
-def _height(t: Array, state: Any) -> tuple[Array, Array]:
+def _height(t: Array, state: Any, *, up: int) -> tuple[Array, Array]:
     """Height [m] and rate of climb [m/s]."""
-    return state.position[..., 1], state.velocity[..., 1]
+    return state.position[..., up], state.velocity[..., up]
+
+
+_HEIGHTS = [partial(_height, up=axis) for axis in range(3)]
+"""What is recorded of a flight, by the axis that is up; named once, since a new function would compile anew."""
 
 
 def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:

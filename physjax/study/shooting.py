@@ -214,7 +214,8 @@ def nearest(
     """The launch that comes nearest the target, from a start on, at a speed, and its distance [m].
 
     The method of Levenberg and Marquardt. Unknown are the direction, as turns about it, and the logarithm of the flight
-    time. Only the `wanted` lanes leave their start, and have a distance that is finite.
+    time. Only the `wanted` lanes leave their start, and have a distance that is finite. A lane is done when its steps
+    are small and, where it hits, when they no longer halve the distance: then only rounding is left of it.
     """
     still, zero = jnp.zeros_like(start.time), jnp.zeros_like(start.velocity)
     steps, least = jnp.array(shots.steps, jnp.int32), 0.1 * float(jnp.finfo(still.dtype).eps) ** 0.5
@@ -229,10 +230,12 @@ def nearest(
         miss, slopes = shots.sensitivity(tried, [*directions, Launch(zero, tried.time)], steps)
         better = norm(miss) < now.distance
         small = (norm(stacked(step)) <= least) & jnp.isfinite(now.distance)
+        # a damped step leaves a share of the miss; the distance of a nearest miss stays, that of a hit goes on falling
+        falls = norm(miss) < 0.5 * now.distance
         after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.going)
         worse = now._replace(damping=3.0 * now.damping)
         after = chosen(better, after, worse)
-        return after._replace(going=~small & (after.damping < 1e8))
+        return after._replace(going=~(small & ~falls) & (after.damping < 1e8))
 
     # the first step is none at all, and finds the slopes
     axes = tuple(jnp.broadcast_to(row, zero.shape) for row in jnp.eye(zero.shape[-1], dtype=zero.dtype))
