@@ -48,6 +48,7 @@ class Height(eqx.Module):
         return position[..., self.up] - self.height.astype(position.dtype)
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
     demand_particles("crossing", run.scene.state, "of bodies record the gap instead")

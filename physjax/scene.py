@@ -176,6 +176,7 @@ class Scene(eqx.Module):
     emitter: eqx.Module | None
     reaction: Callable | None = eqx.field(init=False)
 
+    @jax.transfer_guard("allow")  # what a scene is given goes to the device on purpose
     def __init__(
         self,
         state: Any,

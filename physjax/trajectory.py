@@ -78,6 +78,7 @@ class Trajectory(eqx.Module):
         return self.stepper.function if isinstance(self.stepper, Function) else self.stepper
 
     @property
+    @jax.transfer_guard("allow")
     def final_step(self) -> Int[Array | np.ndarray, ""]:
         """The count of steps at the end, to resume from.
 
@@ -89,6 +90,7 @@ class Trajectory(eqx.Module):
         return self.first_step + self.steps
 
     @property
+    @jax.transfer_guard("allow")
     def first_bad_step(self) -> Int[Array, "..."]:
         """The first step after which a lane was no longer finite, -1 where `.ok`.
 
@@ -175,6 +177,7 @@ class Trajectory(eqx.Module):
             np.savez_compressed(file, **{name: np.asarray(array) for name, array in arrays.items()})
 
     @classmethod
+    @jax.transfer_guard("allow")
     def load(cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Any = None) -> "Trajectory":
         """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
 

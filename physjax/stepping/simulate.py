@@ -26,6 +26,7 @@ from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def simulate(
     scene: Scene,
     method: Callable,
@@ -75,7 +76,7 @@ def simulate(
 
 def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
-    changing = _changing(scene, dt)
+    changing = changing_parts(scene, dt)
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
@@ -165,10 +166,11 @@ def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: Array
     One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
-    changing = _changing(scene, dt)
+    changing = changing_parts(scene, dt)
     moving, still = eqx.partition(scene, changing)
 
     def step(i, moving):
+        i = jnp.asarray(i, jnp.int32)  # a plain number where jit is disabled
         return eqx.filter(_step(eqx.combine(moving, still), method, i, dt), changing)
 
     def frame(moving, index):
@@ -188,6 +190,7 @@ class StateAfter(NamedTuple):
     ok: Bool[Array, "..."]
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: ArrayLike) -> StateAfter:
     """The state after a `duration` [s] in equal steps of about `dt` [s]: the nearest count that fits, at least one.
 
@@ -210,7 +213,7 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
     return StateAfter(end, steps, dt, scene.finite(end))
 
 
-def _changing(scene: Scene, dt: ArrayLike) -> Any:
+def changing_parts(scene: Scene, dt: ArrayLike) -> Any:
     """Mask over the scene's arrays: the state, what contacts remember, and what `advance` replaces in a force.
 
     The last is found by tracing it and comparing identities.

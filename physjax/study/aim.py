@@ -96,6 +96,7 @@ class Aimed(eqx.Module):
         return shots(self, every=every, ax=ax)
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def aim_at(
     scene: Scene,
     target: ArrayLike,
