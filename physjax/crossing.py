@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import quantity
+from physjax.closures import warn_of_remade
 from physjax.lanes import any_lane, wide
 from physjax.loops import repeat, time_at
 from physjax.particles import demand_particles
@@ -57,6 +58,7 @@ def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
         )
     if not hasattr(surface, "gap"):
+        warn_of_remade("crossing", [surface], depth=6)
         surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
@@ -71,7 +73,7 @@ def _crossing(run: Any, surface: Any, way: Array) -> Crossing:
 
 def _crossing_of_one(run: Any, surface: Any, way: Array) -> Crossing:
     scene, gap = run.scene, _checked_gap(surface, run.scene)
-    if not scene.couples:
+    if not (scene.couples and scene.state.lanes):  # one ball is tied to nobody, whatever its forces say
         return _unit_crossing(run, gap, way, lambda leaf: leaf)
 
     def of_node(n):

@@ -134,7 +134,7 @@ class Trajectory(eqx.Module):
     def crossing(self, surface: Any, *, direction: int | None = None) -> Crossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 
-        `surface` is a height [m] along the scene's `up` (y by default), a number or one per lane; anything with a `gap(t, position)`, such as
+        `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
         `contacts.Plane`; or a function `(t, position) -> signed distance` [m], one for each lane, with t a scalar or per
         lane. `direction` -1 looks for what goes from positive gaps to negative (downward), +1 for the opposite. The step
         is found by stepping again between the frames, the moment in it along the method's own path: the error falls with

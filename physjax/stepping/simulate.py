@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import positive_integer, real_quantity
+from physjax.closures import warn_of_remade
 from physjax.lanes import FEWEST, in_pieces
 from physjax.loops import repeat, time_at
 from physjax.scene import Scene, as_module, changes, plain_functions
@@ -67,6 +68,7 @@ def simulate(
     if steps % save_every:
         raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
     method = as_module(method)
+    warn_of_remade("simulate", (*(plain.function for plain in plain_functions((scene, method))), record))
     first_step = jnp.asarray(first_step, jnp.int32)
     rollout = _rollout
     if record is None and _stands_alone((scene, method, dt, first_step)):
@@ -208,7 +210,9 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
         raise ValueError(f"state_after: got shapes {duration.shape} and {dt.shape}, expected one duration and one dt.")
     steps = jnp.maximum(1, jnp.round(duration / dt)).astype(jnp.int32)
     dt = duration / steps.astype(dt.dtype)
-    states = sample(scene, as_module(method), dt, steps, 1)
+    method = as_module(method)
+    warn_of_remade("state_after", [plain.function for plain in plain_functions((scene, method))])
+    states = sample(scene, method, dt, steps, 1)
     end = jax.tree.map(lambda leaf: leaf[-1], states)
     return StateAfter(end, steps, dt, scene.finite(end))
 
