@@ -32,8 +32,6 @@ __all__ = ["Aimed", "Shot", "aim_at"]
 
 STEPS = 200
 """Steps of a flight unless told otherwise."""
-ROUNDINGS = 512
-"""A target that is missed by no more than so many roundings of the flight's extent is hit."""
 
 
 class Shot(NamedTuple):
@@ -156,7 +154,7 @@ def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -
     across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
     flight = shots.flight(launch, save_every=1, record=_HEIGHTS[up])
     residual = flight.final_scene.state.position - shots.target
-    ok = legal & (norm(residual) <= _tolerance(shots, launch))
+    ok = legal & (norm(residual) <= shots.rounding(launch))
     velocity, time = launch = _fixed_unless(ok, launch)
     level = [velocity[..., axis] for axis in across]
     forward = level[0] if len(level) == 1 else norm(jnp.stack(level, axis=-1))
@@ -179,15 +177,9 @@ def _searched(shots: Range, speed: Array | None, late: Array | None) -> tuple[La
         return launch, found
     # without a force to bring it back there is no high arc, and the search for it runs away
     launch = chosen(norm(launch.velocity) > 0.5 * speed, launch, first_guess(shots, speed))
-    too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * _tolerance(shots, launch)
+    too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * shots.rounding(launch)
     launch, _ = nearest(shots, launch, speed, too_fast | ~found)
     return launch, jnp.ones_like(found)
-
-
-def _tolerance(shots: Range, launch: Launch) -> Array:
-    """Rounding errors of a flight of this extent [m]."""
-    extent = norm(shots.offset) + norm(launch.velocity) * launch.time
-    return lax.stop_gradient(ROUNDINGS * float(jnp.finfo(extent.dtype).eps) * extent)
 
 
 def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Launch, Array]:

@@ -36,7 +36,8 @@ def find_bounced(
     launches, distance = lax.map(lambda start: nearest(shots, start, speed, wanted), starts)
     right = lax.map(lambda launch: _touches(shots, launch), launches) == bounces
     extent = speed[None] * launches.time
-    hit = right & (distance <= float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent)
+    near = float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent
+    hit = right & (distance <= jnp.maximum(near, shots.rounding(launches)))
     order = jnp.where(late, -launches.time, launches.time)
     # hits come first, by time; then the nearest with the right number of bounces; then the others
     worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0)) + 1

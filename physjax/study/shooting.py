@@ -27,6 +27,8 @@ MOST, MOST_DOWNHILL = 40, 100
 """Steps of a search, and of a descent to the nearest miss, after which it is given up."""
 COARSE = 16
 """Steps of a flight while the shot is still far from its target."""
+ROUNDINGS = 512
+"""A target that is missed by no more than so many roundings of the flight's extent is hit."""
 FARTHEST = math.e
 """A search changes the flight time by no more than this factor at once."""
 
@@ -77,6 +79,17 @@ class Range(eqx.Module):
             return self.flight(launch).final_scene.state.position - self.target
         dt = launch.time / steps.astype(launch.time.dtype)
         return sample(self.fired(launch.velocity), self.method, dt, steps, 1).position[1] - self.target
+
+    def rounding(self, launch: Launch) -> Float[Array, "*lanes"]:
+        """What rounding leaves of a miss [m]: of the flight's extent and, far from the origin, of a place at every step.
+
+        A miss beyond the square root of a rounding of the extent is one, wherever the shot is fired.
+        """
+        extent = norm(self.offset) + norm(launch.velocity) * launch.time
+        away = jnp.maximum(norm(self.scene.state.position), norm(self.target))
+        eps = float(jnp.finfo(extent.dtype).eps)
+        left = eps * jnp.maximum(ROUNDINGS * extent, self.steps * away)
+        return lax.stop_gradient(jnp.minimum(left, eps**0.5 * extent))
 
     def sensitivity(self, launch: Launch, directions: list[Launch], steps: Array | None) -> tuple[Array, list[Array]]:
         """The miss [m], and its derivative along each direction."""
