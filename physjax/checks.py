@@ -18,17 +18,18 @@ from jaxtyping import Array
 
 def concrete(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is being traced."""
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    return None if isinstance(value, jax.core.Tracer) else np.asarray(jax.device_get(value))
 
 
 def real_array(name: str, value: Any) -> Array:
     """`value` as a floating-point array; Python numbers stay weakly typed, integers become floats, else a TypeError."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return jnp.asarray(float(value))
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name}: got {_shown(value)}, expected real numbers or an array of them.") from error
+    with jax.transfer_guard_host_to_device("allow"):  # what a call is given goes to the device on purpose
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return jnp.asarray(float(value))
+        try:
+            array = jnp.asarray(value)
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"{name}: got {_shown(value)}, expected real numbers or an array of them.") from error
     if jnp.issubdtype(array.dtype, jnp.integer):
         return array.astype(jnp.result_type(float))
     if not jnp.issubdtype(array.dtype, jnp.floating):

@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stability.set_defaults(run=lambda options: _stability(options.scene, options.out, options.steps))
 
     aim = commands.add_parser("aim", help="which angle hits a target: both arcs, with drag and wind")
-    aim.add_argument("--target", type=float, nargs="+", required=True, metavar="M", help="x y, or x y z [m]; y is up")
+    aim.add_argument("--target", type=float, nargs="+", required=True, metavar="M", help="x y, or x y z [m]")
     aim.add_argument("--speed", type=float, help="launch speed [m/s]; the least that hits if left out")
     aim.add_argument(
         "--start", type=float, nargs="+", metavar="M", help="where it is fired from [m] (default: the origin)"
@@ -60,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--wind", type=float, nargs="+", metavar="V", help="velocity of the air [m/s]; acts through --drag"
     )
     aim.add_argument("--gravity", type=float, default=9.8, help="g [m/s²] (default: 9.8)")
+    aim.add_argument("--up", choices="xyz", default="y", help="the axis that is up (default: y)")
     aim.add_argument("--out", default="aim", metavar="DIR", help="where the picture goes (default: aim)")
     aim.set_defaults(run=_aim)
 
@@ -292,7 +293,9 @@ def _thrown(options: argparse.Namespace):
             raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
     if options.wind is not None and options.drag is None:
         raise ValueError("--wind: got a wind without --drag, expected both: the air acts through the drag.")
-    loads = [forces.Gravity(options.gravity)]
+    if options.up == "z" and dim == 2:
+        raise ValueError("--up: got z with a target in the plane, expected x or y, or a third number for --target.")
+    loads = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
     if options.drag is not None:
         loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
     return Scene(Particles(start, [0.0] * dim), mass=options.mass, forces=tuple(loads))

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import quantity
+from physjax.closures import warn_of_remade
 from physjax.lanes import any_lane, wide
 from physjax.loops import repeat, time_at
 from physjax.particles import demand_particles
@@ -38,15 +39,17 @@ class Crossing(NamedTuple):
 
 
 class Height(eqx.Module):
-    """All places at one height y [m], a number or one per lane; in one dimension that is the coordinate itself."""
+    """All places at one height [m] along the axis `up`, a number or one per lane; in one dimension the coordinate itself."""
 
     height: Float[Array, "..."] = quantity("height", "m")
+    up: int = eqx.field(static=True, default=1)
 
     def gap(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """How far above [m]."""
-        return position[..., min(1, position.shape[-1] - 1)] - self.height.astype(position.dtype)
+        return position[..., self.up] - self.height.astype(position.dtype)
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
     demand_particles("crossing", run.scene.state, "of bodies record the gap instead")
@@ -55,7 +58,8 @@ def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
         )
     if not hasattr(surface, "gap"):
-        surface = as_module(surface) if callable(surface) else Height(surface)
+        warn_of_remade("crossing", [surface], depth=6)
+        surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
@@ -69,7 +73,7 @@ def _crossing(run: Any, surface: Any, way: Array) -> Crossing:
 
 def _crossing_of_one(run: Any, surface: Any, way: Array) -> Crossing:
     scene, gap = run.scene, _checked_gap(surface, run.scene)
-    if not scene.couples:
+    if not (scene.couples and scene.state.lanes):  # one ball is tied to nobody, whatever its forces say
         return _unit_crossing(run, gap, way, lambda leaf: leaf)
 
     def of_node(n):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -22,6 +22,8 @@ def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
     """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
     if count == 1:
         return step(first, carry)
+    if jax.config.jax_disable_jit:  # a checkpoint would trace it all the same, and hide the numbers from who looks
+        return reduce(lambda carry, i: step(first + i, carry), range(count), carry)
     inner = _near_root(count) if count > 16 else count
     outer, rest = divmod(count, inner)
 

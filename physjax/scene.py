@@ -79,6 +79,7 @@ class Scene(eqx.Module):
     emitter: eqx.Module | None
     reaction: Callable | None = eqx.field(init=False)
 
+    @jax.transfer_guard("allow")  # what a scene is given goes to the device on purpose
     def __init__(
         self,
         state: Any,
@@ -123,6 +124,13 @@ class Scene(eqx.Module):
     def couples(self) -> bool:
         """Whether any force or contact ties lanes together; a force that does not say counts as coupling."""
         return any(getattr(part, "couples", True) for part in (*self.forces, *self.contacts))
+
+    @property
+    def up(self) -> int:
+        """The axis that points up: that of the weight, else of what else has an `up`, else y, of a line the only one."""
+        named = [part for part in self.forces if isinstance(getattr(part, "up", None), int)]
+        first = sorted(named, key=lambda part: not isinstance(part, Field))
+        return first[0].up if first else min(1, self.state.position.shape[-1] - 1)
 
     @property
     def held(self) -> Bool[Array, "*lanes"] | None:

@@ -78,6 +78,7 @@ class Trajectory(eqx.Module):
         return self.stepper.function if isinstance(self.stepper, Function) else self.stepper
 
     @property
+    @jax.transfer_guard("allow")
     def final_step(self) -> Int[Array | np.ndarray, ""]:
         """The count of steps at the end, to resume from.
 
@@ -89,6 +90,7 @@ class Trajectory(eqx.Module):
         return self.first_step + self.steps
 
     @property
+    @jax.transfer_guard("allow")
     def first_bad_step(self) -> Int[Array, "..."]:
         """The first step after which a lane was no longer finite, -1 where `.ok`.
 
@@ -132,7 +134,7 @@ class Trajectory(eqx.Module):
     def crossing(self, surface: Any, *, direction: int | None = None) -> Crossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 
-        `surface` is a height y [m], a number or one per lane; anything with a `gap(t, position)`, such as
+        `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
         `contacts.Plane`; or a function `(t, position) -> signed distance` [m], one for each lane, with t a scalar or per
         lane. `direction` -1 looks for what goes from positive gaps to negative (downward), +1 for the opposite. The step
         is found by stepping again between the frames, the moment in it along the method's own path: the error falls with
@@ -175,6 +177,7 @@ class Trajectory(eqx.Module):
             np.savez_compressed(file, **{name: np.asarray(array) for name, array in arrays.items()})
 
     @classmethod
+    @jax.transfer_guard("allow")
     def load(cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Any = None) -> "Trajectory":
         """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
 

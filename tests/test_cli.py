@@ -76,6 +76,14 @@ def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
     assert "nearest misses" in capsys.readouterr().out
 
 
+def test_aim_takes_the_axis_that_is_up(tmp_path, capsys):
+    aim = ["aim", "--speed", "30", "--target", "24", "32", "0", "--up", "z", "--out", str(tmp_path)]
+    assert main(aim) == 0
+    printed = capsys.readouterr().out
+    assert "12.9103" in printed
+    assert "53.1301" in printed  # the azimuth, from x towards y
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -83,6 +91,7 @@ def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
         (["--speed", "30", "--wind", "1", "0"], "without --drag"),
         (["--speed", "30", "--start", "1"], "expected 2"),
         (["--speed", "30", "--start", "40", "0"], "away from the launch"),
+        (["--speed", "30", "--up", "z"], "expected x or y"),
     ],
 )
 def test_aim_refuses_what_cannot_be(options, words, tmp_path, capsys):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, Trajectory, contacts, forces, methods, reference, simulate
+from physjax.study.outcomes import height
 from physjax.vectors import scale, upward
 
 SPEEDS = np.array([[10.0, 12.0], [3.0, 14.0], [20.0, 8.0]])
@@ -275,3 +276,25 @@ def test_bad_input_is_told_in_plain_words(unannotated):
         told.crossing(0.0)
     with pytest.raises(ValueError, match="does not know its scene and method"):
         reference(flight.scene, [0.1, 0.2]).crossing(0.0)
+
+
+def test_a_height_is_along_the_axis_that_is_up():
+    start = jnp.array([[5.0, -3.0, 2.0], [1.0, 1.0, 8.0]])
+    fall = simulate(
+        Scene(Particles(start, jnp.ones((2, 3))), forces=(forces.Gravity(up=2),)), methods.rk4, dt=0.1, steps=20
+    )
+    at = fall.crossing(0.5, direction=-1)
+    above = np.asarray(start[:, 2]) - 0.5
+    assert at.ok.all()
+    np.testing.assert_allclose(at.time, (1 + np.sqrt(1 + 2 * 9.8 * above)) / 9.8, atol=1e-12)
+    np.testing.assert_allclose(at.position[:, 2], 0.5, atol=1e-12)
+    assert height(fall) == fall.position[..., 2].max()
+
+
+def pull(t, state, mass):
+    return -9.8 * mass * jnp.asarray([0.0, 1.0]) + 0.0 * state.velocity
+
+
+def test_one_ball_whose_force_does_not_say_that_it_is_independent_has_its_crossing():
+    fall = simulate(Scene(Particles(jnp.array([0.0, 4.9]), jnp.zeros(2)), forces=(pull,)), methods.rk4, dt=0.3, steps=5)
+    assert fall.crossing(0.0).time == pytest.approx(1.0, abs=1e-12)

@@ -283,3 +283,13 @@ def test_a_force_that_cannot_be_one(unannotated, bad):
         TypeError, match=r"forces: got .*, expected a force: a callable \(t, state, mass\) -> newtons\."
     ):
         Scene(five(), forces=(forces.Gravity(), bad))
+
+
+def test_up_is_the_axis_of_the_weight_else_of_what_has_one_else_y():
+    space, line = Particles(jnp.zeros(3), jnp.zeros(3)), Particles(jnp.zeros(1), jnp.zeros(1))
+    lift = forces.Buoyancy(1.2, volume=1.0, up=2)
+    assert Scene(space).up == 1
+    assert Scene(space, forces=(lift,)).up == 2
+    assert Scene(space, forces=(lift, forces.Gravity(up=2))).up == 2
+    assert Scene(line).up == 0
+    assert Scene(line, forces=(forces.Gravity(up=0),)).up == 0

@@ -1,7 +1,8 @@
 """Runs for Blender, engines and other programs: animated glTF, and PLY files frame by frame. `Trajectory.save` writes NPZ.
 
 What a film is exported as, `shown`, is as in `animate.view`: a lattice with faces, springs, a `solids` shape or one for
-each body; without it the scene says. Metres and y up. In the plane z is 0.
+each body; without it the scene says. Metres; glTF has y up, and a scene with another axis up is turned by its root node,
+PLY has the axes of the scene. In the plane z is 0.
 """
 
 import os
@@ -66,7 +67,7 @@ def gltf(
             f"{who}: got springs that part, expected ones that hold: glTF cannot take a line away. export.ply writes "
             "those that hold."
         )
-    document = Document()
+    document = Document(seen.take.up if seen.take.dim == 3 else 1)
     times = document.accessor(np.arange(len(frames)) / fps)
     material = document.material(_rgb(color))
     if isinstance(seen, Bodies):

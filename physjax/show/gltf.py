@@ -1,6 +1,6 @@
 """A glTF 2.0 file in one piece (.glb): arrays in one binary chunk, and the JSON that says what they are.
 
-Metres, seconds and y up, as here; quaternions are (x, y, z, w). Source: the Khronos glTF 2.0 specification.
+Metres, seconds and y up; quaternions are (x, y, z, w). Source: the Khronos glTF 2.0 specification.
 """
 
 import json
@@ -13,13 +13,19 @@ POINTS, LINES, TRIANGLES = 0, 1, 4
 """What a primitive is made of."""
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
+_UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
+"""The turn by a right angle that brings x, about z, or z, about x, to y."""
 _WIDTHS = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
 
 
 class Document:
-    """A scene under construction: add meshes, nodes and channels, then take its `.bytes()`."""
+    """A scene under construction: add meshes, nodes and channels, then take its `.bytes()`.
 
-    def __init__(self) -> None:
+    Its own axis `up` becomes the file's y by a turn about a level axis, as a node that holds all others.
+    """
+
+    def __init__(self, up: int = 1) -> None:
+        self._up = up
         self._json: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "physjax"},
             "scene": 0,
@@ -77,6 +83,10 @@ class Document:
         """The file: a header, the JSON padded with blanks, and the arrays."""
         binary = b"".join(self._chunks)
         content = self._json | {"buffers": [{"byteLength": len(binary)}]}
+        if self._up in _UPRIGHT and "nodes" in self._json:
+            held, nodes = self._json["scenes"][0]["nodes"], self._json["nodes"]
+            content["nodes"] = [*nodes, {"name": "upright", "children": held, "rotation": _UPRIGHT[self._up]}]
+            content["scenes"] = [{"nodes": [len(nodes)]}]
         if self._channels:
             content["animations"] = [{"name": "run", "channels": self._channels, "samplers": self._samplers}]
         text = json.dumps(content, separators=(",", ":")).encode()

@@ -20,7 +20,7 @@ from physjax.show.stage import Stage
 
 GREY, STONE = "#9AA3AD", "#C9CDD2"
 LIGHT = np.array([0.3, 0.7, 0.65]) / np.sqrt(0.3**2 + 0.7**2 + 0.65**2)
-"""Towards the lamp: from above, over the right shoulder of who looks."""
+"""Towards the lamp where y is up: from above, over the right shoulder of who looks."""
 NEAR = 0.3
 """A floor is worth showing when it is no farther from what moves than this share of the picture."""
 BALL = 0.985
@@ -67,7 +67,7 @@ def flat(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
     return drawn
 
 
-def in_space(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
+def in_space(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> list[Any]:
     """Planes, slabs, rooms and bowls as sheets of glass behind everything; balls are drawn by `solid`."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -83,7 +83,7 @@ def in_space(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
     for contact in contacts:
         if isinstance(contact, Sphere) and contact.inside:
             bowl = _within(stage, _sphere(contact, t))
-            far = (bowl.corners.mean(axis=1) - _center(contact, t))[:, 1] < 0
+            far = (bowl.corners.mean(axis=1) - _center(contact, t))[:, up] < 0
             drawn.append(Poly3DCollection(bowl.corners[far], facecolors=GREY, linewidths=0, alpha=0.12, zorder=0))
             ax.add_collection3d(drawn[-1])
     return drawn
@@ -95,25 +95,25 @@ def balls(stage: Stage, contacts: tuple, t: float) -> list[Ball]:
     return [_within(stage, ball) for ball in spheres]
 
 
-def solid(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
+def solid(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> list[Any]:
     """Draw the balls in the way, behind what moves."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     drawn = []
     for ball in balls(stage, contacts, t):
-        lit = shades(ball)
+        lit = shades(ball, up)
         drawn.append(Poly3DCollection(ball.corners, facecolors=lit, edgecolors=lit, linewidths=0.3, zorder=1))
         ax.add_collection3d(drawn[-1])
     return drawn
 
 
-def hidden(balls: list[Ball], points: np.ndarray, ax: Any) -> np.ndarray:
+def hidden(balls: list[Ball], points: np.ndarray, ax: Any, up: int = 1) -> np.ndarray:
     """Which points `(points, 3)` stand behind one of the balls, as the axes are turned when they are drawn.
 
     Sorting polygons by depth, as matplotlib does, lets a ball show through the cloth that lies on it.
     """
-    up, turn = np.radians([ax.elev, ax.azim])
-    eye = np.array([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)])
+    rise, turn = np.radians([ax.elev, ax.azim])
+    eye = upright(np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)]), up)
     behind = np.zeros(len(points), bool)
     for ball in balls:
         away = points - ball.center
@@ -122,11 +122,16 @@ def hidden(balls: list[Ball], points: np.ndarray, ax: Any) -> np.ndarray:
     return behind
 
 
-def shades(ball: Ball) -> np.ndarray:
+def upright(vector: np.ndarray, up: int) -> np.ndarray:
+    """A vector of a space in which y is up as one of a space in which another axis is: the three in the same cycle."""
+    return np.roll(vector, up - 1)
+
+
+def shades(ball: Ball, up: int = 1) -> np.ndarray:
     """Colours of a ball's patches, lighter towards the lamp."""
     from matplotlib.colors import to_rgb
 
-    return (0.72 + 0.28 * np.maximum(ball.normals @ LIGHT, 0))[:, None] * to_rgb(STONE)
+    return (0.72 + 0.28 * np.maximum(ball.normals @ upright(LIGHT, up), 0))[:, None] * to_rgb(STONE)
 
 
 def moving(contacts: tuple) -> bool:

@@ -29,6 +29,11 @@ class Scenery(NamedTuple):
     contacts: tuple
 
     @property
+    def up(self) -> int:
+        """The axis that is up."""
+        return self.take.up
+
+    @property
     def flat(self) -> bool:
         """Whether it is drawn in the plane."""
         return len(self.stage.low) == 2
@@ -39,8 +44,9 @@ class Scenery(NamedTuple):
 
     def obstacles(self, ax: Any, frame: int) -> list[Any]:
         """Draw what is in the way."""
-        draw = obstacles.flat if self.flat else obstacles.in_space
-        return draw(ax, self.stage, self.contacts, self.take.time[frame])
+        if self.flat:
+            return obstacles.flat(ax, self.stage, self.contacts, self.take.time[frame])
+        return obstacles.in_space(ax, self.stage, self.contacts, self.take.time[frame], self.up)
 
 
 def scenery_of(take: Take, frames: Any) -> Scenery:
@@ -65,7 +71,7 @@ def panels(scenery: Scenery, frames: Sequence[int], draw: Callable, figure: Any,
 def arranged(figure: Any, scenery: Scenery, count: int, bar: Any = None) -> list[Any]:
     """Empty axes for so many panels; the figure becomes as high as they need."""
     rows, columns = _grid(scenery, count)
-    drawn = [axes(figure, (rows, columns, place), scenery.stage) for place in range(1, count + 1)]
+    drawn = [axes(figure, (rows, columns, place), scenery.stage, scenery.up) for place in range(1, count + 1)]
     lines = 1 + scenery.take.blew_up
     for ax in drawn:
         ax.set_title(scenery.take.title(0), fontsize=10, color="0.2")

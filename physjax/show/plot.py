@@ -17,6 +17,7 @@ from physjax.show.stage import AZIMUTH, ELEVATION
 from physjax.show.strands import springs
 from physjax.show.surfaces import cloth
 from physjax.show.sweeps import sweep
+from physjax.show.takes import up_of
 from physjax.stepping.methods import METHODS
 from physjax.trajectory import Trajectory
 
@@ -80,7 +81,7 @@ def style(method: str) -> dict[str, Any]:
 
 
 def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None, ax: Any = None) -> Any:
-    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three, y up.
+    """Draw the paths of a run: height over time in one dimension, the plane in two, space in three, up as in the scene.
 
     `every` draws one lane in so many; `color` colours lanes by a value each. Returns the axes.
 
@@ -90,12 +91,11 @@ def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None,
         ('x [m]', 'y [m]')
     """
     position = np.asarray(flight.position)
-    return _paths(
-        np.asarray(flight.time), position.reshape(position.shape[0], -1, position.shape[-1]), every, color, ax
-    )
+    position, up = position.reshape(position.shape[0], -1, position.shape[-1]), up_of(flight)
+    return _paths(np.asarray(flight.time), position, every, color, ax, up)
 
 
-def _paths(time: np.ndarray, position: np.ndarray, every: int, color: Any, ax: Any) -> Any:
+def _paths(time: np.ndarray, position: np.ndarray, every: int, color: Any, ax: Any, up: int = 1) -> Any:
     """Lines through `(frames, lanes, dim)` positions."""
     from matplotlib import colormaps
     from matplotlib import pyplot as plt
@@ -105,7 +105,7 @@ def _paths(time: np.ndarray, position: np.ndarray, every: int, color: Any, ax: A
     if ax is None:
         ax = plt.figure(figsize=(6, 4), layout="constrained").add_subplot(projection="3d" if dim == 3 else None)
         if dim == 3:
-            ax.view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="y")
+            ax.view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="xyz"[up])
     count = position.shape[1]
     shade = np.arange(count) if color is None else np.asarray(color).ravel()[::every]
     span = np.ptp(shade) or 1.0

@@ -25,12 +25,15 @@ def shots(aimed: Any, *, every: int = 1, ax: Any = None) -> Any:
     points = points[np.isfinite(points).all(axis=-1)]
     contacts = obstacles.shown(aimed.shots.scene.contacts)
     stage = obstacles.with_obstacles(Stage(points.min(axis=0), points.max(axis=0)), contacts).grown(0.05)
-    own = ax is None
+    own, above = ax is None, aimed.shots.scene.up
     if own:
         across, up = (stage.high - stage.low)[:2]
         height = 0.8 * WIDTH if target.shape[-1] == 3 else float(np.clip(0.9 * WIDTH * up / across, 2.2, WIDTH)) + 1.2
-        ax = axes(plt.figure(figsize=(WIDTH, height), layout="constrained"), (1, 1, 1), stage)
-    (obstacles.flat if target.shape[-1] == 2 else obstacles.in_space)(ax, stage, contacts, 0.0)
+        ax = axes(plt.figure(figsize=(WIDTH, height), layout="constrained"), (1, 1, 1), stage, above)
+    if target.shape[-1] == 2:
+        obstacles.flat(ax, stage, contacts, 0.0)
+    else:
+        obstacles.in_space(ax, stage, contacts, 0.0, above)
     for (name, shot), colour in zip(arcs.items(), (LOW, HIGH), strict=False):
         _arc(ax, paths[name], np.asarray(shot.ok).ravel()[::every], colour, _words(name, shot))
     start = next(iter(paths.values()))[0]

@@ -1,4 +1,4 @@
-"""Where things are drawn: axes in metres, y up, the same scale in every direction, and limits that do not move."""
+"""Where things are drawn: axes in metres, up as in the scene, the same scale in every direction, and limits that do not move."""
 
 from typing import Any, NamedTuple
 
@@ -7,7 +7,7 @@ import numpy as np
 from physjax.show.takes import Take
 
 ELEVATION, AZIMUTH = 16.0, 28.0
-"""From where space is seen [degrees]: from above, and turned from the z axis towards x."""
+"""From where space is seen [degrees]: from above, and turned from the axis after the one that is up (z if y is) to the next."""
 FARTHEST = 4.0
 """Of a run that blew up, frames so many times larger than its first do not set the limits."""
 
@@ -51,8 +51,8 @@ def stage_of(take: Take, frames: Any) -> Stage:
     return Stage(low.min(axis=0), high.max(axis=0))
 
 
-def axes(figure: Any, place: tuple[int, int, int], stage: Stage) -> Any:
-    """Axes for a box in the plane or in space, which stay as they are whatever is drawn into them."""
+def axes(figure: Any, place: tuple[int, int, int], stage: Stage, up: int = 1) -> Any:
+    """Axes for a box in the plane or in space, where one is `up`, which stay as they are whatever is drawn into them."""
     flat = len(stage.low) == 2
     ax = figure.add_subplot(*place, projection=None if flat else "3d")
     names = "xy" if flat else "xyz"
@@ -67,12 +67,12 @@ def axes(figure: Any, place: tuple[int, int, int], stage: Stage) -> Any:
         for edge in ax.spines.values():
             edge.set_color("0.75")
     else:
-        _in_space(ax, stage)
+        _in_space(ax, stage, up)
     return ax
 
 
-def _in_space(ax: Any, stage: Stage) -> None:
-    ax.view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="y")
+def _in_space(ax: Any, stage: Stage, up: int) -> None:
+    ax.view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="xyz"[up])
     ax.set_proj_type("persp", focal_length=1.6)
     ax.computed_zorder = False
     ax.patch.set_visible(False)  # boxes reach into their neighbours' axes

@@ -121,7 +121,7 @@ def lines(ax: Any, scenery: Scenery, frame: int, *, strands: Strands) -> list[An
     return (
         drawn
         if scenery.flat
-        else drawn + obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame])
+        else drawn + obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame], scenery.up)
     )
 
 

@@ -30,8 +30,8 @@ def cloth(
     """Draw the faces of a cloth, a jelly or a mesh in space at chosen frames, side by side, shaded by Lambert's law.
 
     `sheet` is the lattice that the film's scene was made from. `frames` are numbers of frames, negative ones from the
-    end; without them the first, the middle and the last good one. Of a batch of scenes `scene` picks one. y is up, all
-    directions have the same scale [m], and balls, floors and rooms of the scene are drawn lightly. Returns the figure.
+    end; without them the first, the middle and the last good one. Of a batch of scenes `scene` picks one. Up is as in the scene,
+    all directions have the same scale [m], and balls, floors and rooms of the scene are drawn lightly. Returns the figure.
     Raises TypeError, ValueError or IndexError for a film, a sheet or frames that do not fit.
 
     Example:
@@ -56,13 +56,13 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
 
     position = scenery.position(frame)
     faces = faces[scenery.stage.holds(position)[faces].all(axis=1)]
-    triangles, colours = position[faces], brightness(position, faces)[:, None] * to_rgb(color)
+    triangles, colours = position[faces], brightness(position, faces, scenery.up)[:, None] * to_rgb(color)
     balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
-    layers = np.where(obstacles.hidden(balls, triangles.mean(axis=1), ax), 2, 4)
+    layers = np.where(obstacles.hidden(balls, triangles.mean(axis=1), ax, scenery.up), 2, 4)
     if closed:
         layers[looks_away(triangles, ax)] = 1
     groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
-    groups += [(ball.corners, obstacles.shades(ball), 3) for ball in balls]
+    groups += [(ball.corners, obstacles.shades(ball, scenery.up), 3) for ball in balls]
     drawn = [
         Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
         for polygons, shades, order in groups
@@ -82,7 +82,7 @@ def looks_away(triangles: np.ndarray, ax: Any) -> np.ndarray:
     return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
 
 
-def brightness(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def brightness(position: np.ndarray, faces: np.ndarray, up: int = 1) -> np.ndarray:
     """Lambert's law, seen from both sides: ambient light and the rest times |n·l|, for each face.
 
     n at a corner is the mean of the faces around it, by area, so that a coarse sheet looks as smooth as it is meant;
@@ -94,7 +94,7 @@ def brightness(position: np.ndarray, faces: np.ndarray) -> np.ndarray:
     around = np.stack([np.bincount(corners, weights[:, i], len(position)) for i in range(3)], axis=-1)
     own, mean = _unit(normal)[:, None], _unit(around)[faces]
     smooth = (own * mean).sum(axis=-1, keepdims=True) > SMOOTH
-    return AMBIENT + (1 - AMBIENT) * np.abs(np.where(smooth, mean, own) @ LIGHT).mean(axis=1)
+    return AMBIENT + (1 - AMBIENT) * np.abs(np.where(smooth, mean, own) @ obstacles.upright(LIGHT, up)).mean(axis=1)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

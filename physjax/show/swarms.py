@@ -35,7 +35,7 @@ class Swarm(NamedTuple):
         # matplotlib cannot add a collection of nothing in space
         lines = [Line3DCollection(pieces, colors=colours, linewidths=1.2, zorder=3)] if len(pieces) else []
         trail = [ax.add_collection3d(line) for line in lines]
-        balls = obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame])
+        balls = obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame], scenery.up)
         return [*trail, ax.scatter(*position[seen].T, depthshade=True, **dots), *balls]
 
     def _trail(self, take: Take, frame: int) -> tuple[np.ndarray, np.ndarray]:

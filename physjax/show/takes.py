@@ -12,7 +12,7 @@ DAY = 86400.0
 
 
 class Take(NamedTuple):
-    """One scene of a run: `time` (frames,) [s], `position` (frames, nodes, dim) [m], and how many frames are `good`.
+    """One scene of a run: `time` (frames,) [s], `position` (frames, nodes, dim) [m], how many frames are `good`, the axis `up`.
 
     A frame is good until a node is no longer finite; where lanes are independent, until none is.
     """
@@ -21,6 +21,7 @@ class Take(NamedTuple):
     position: np.ndarray
     good: int
     surfaces: tuple
+    up: int = 1
 
     @property
     def blew_up(self) -> bool:
@@ -189,7 +190,12 @@ def _checked(who, film, time, position, whole, dims) -> Take:
     if not whole[0]:
         raise ValueError(f"{who}: got a film whose first frame is not finite, expected a start that can be drawn.")
     good = len(whole) if whole.all() else int(np.argmin(whole))
-    return Take(time, position, good, () if film.scene is None else film.scene.contacts)
+    return Take(time, position, good, () if film.scene is None else film.scene.contacts, up_of(film))
+
+
+def up_of(film: Trajectory) -> int:
+    """The axis that is up in a run: its scene's; y where it does not know its scene."""
+    return min(1, film.position.shape[-1] - 1) if film.scene is None else film.scene.up
 
 
 def _example(scenes: tuple[int, ...]) -> str:

@@ -78,7 +78,7 @@ def view(
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> View:
-    """A run in space as a page to turn, zoom, pan and play, with floors, walls and balls, axes in metres, y up.
+    """A run in space as a page to turn, zoom, pan and play, with floors, walls and balls, axes in metres, up as in the scene.
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
     lines coloured by strain, a `solids` shape or one for each body. Without it bodies are boxes of their inertia, nodes
@@ -117,6 +117,7 @@ def view(
             "high": high.tolist(),
             "reach": [end.tolist() for end in _reach(scenery)],
             "from": [ELEVATION, AZIMUTH],
+            "up": scenery.up,
             "light": obstacles.LIGHT.tolist(),
             "part": part,
             "obstacles": [_obstacle(contact, scenery, frames) for contact in scenery.contacts],

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import positive_integer, real_quantity
+from physjax.closures import warn_of_remade
 from physjax.lanes import FEWEST, in_pieces
 from physjax.loops import repeat, time_at
 from physjax.scene import Scene, as_module, changes, plain_functions
@@ -26,6 +27,7 @@ from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def simulate(
     scene: Scene,
     method: Callable,
@@ -66,6 +68,7 @@ def simulate(
     if steps % save_every:
         raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
     method = as_module(method)
+    warn_of_remade("simulate", (*(plain.function for plain in plain_functions((scene, method))), record))
     first_step = jnp.asarray(first_step, jnp.int32)
     rollout = _rollout
     if record is None and _stands_alone((scene, method, dt, first_step)):
@@ -75,7 +78,7 @@ def simulate(
 
 def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
-    changing = _changing(scene, dt)
+    changing = changing_parts(scene, dt)
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
@@ -166,10 +169,11 @@ def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: Array
     One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
-    changing = _changing(scene, dt)
+    changing = changing_parts(scene, dt)
     moving, still = eqx.partition(scene, changing)
 
     def step(i, moving):
+        i = jnp.asarray(i, jnp.int32)  # a plain number where jit is disabled
         return eqx.filter(_step(eqx.combine(moving, still), method, i, dt), changing)
 
     def frame(moving, index):
@@ -189,6 +193,7 @@ class StateAfter(NamedTuple):
     ok: Bool[Array, "..."]
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: ArrayLike) -> StateAfter:
     """The state after a `duration` [s] in equal steps of about `dt` [s]: the nearest count that fits, at least one.
 
@@ -206,12 +211,14 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
         raise ValueError(f"state_after: got shapes {duration.shape} and {dt.shape}, expected one duration and one dt.")
     steps = jnp.maximum(1, jnp.round(duration / dt)).astype(jnp.int32)
     dt = duration / steps.astype(dt.dtype)
-    states = sample(scene, as_module(method), dt, steps, 1)
+    method = as_module(method)
+    warn_of_remade("state_after", [plain.function for plain in plain_functions((scene, method))])
+    states = sample(scene, method, dt, steps, 1)
     end = jax.tree.map(lambda leaf: leaf[-1], states)
     return StateAfter(end, steps, dt, scene.finite(end))
 
 
-def _changing(scene: Scene, dt: ArrayLike) -> Any:
+def changing_parts(scene: Scene, dt: ArrayLike) -> Any:
     """Mask over the scene's arrays: the state, what contacts remember, and what `advance` replaces in a force.
 
     The last is found by tracing it and comparing identities.

@@ -8,6 +8,7 @@ aimed.low.angle, aimed.high.angle, aimed.low.time, aimed.ok
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -31,15 +32,14 @@ __all__ = ["Aimed", "Shot", "aim_at"]
 
 STEPS = 200
 """Steps of a flight unless told otherwise."""
-ROUNDINGS = 512
-"""A target that is missed by no more than so many roundings of the flight's extent is hit."""
 
 
 class Shot(NamedTuple):
     """A launch and where it leads, for each target.
 
     `angle` is the elevation above the horizontal [rad], beyond a right angle for a shot back along x in the plane; in
-    space `azimuth` [rad] is its bearing from x towards z. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
+    space `azimuth` [rad] is its bearing from x towards z, where z is up from x towards y. Up is what the scene says
+    (`Scene.up`), y by default. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
     `apex`, the greatest height on the way [m]; `residual`, from the target to where the flight ends [m]. Where `ok` is
     False this is the nearest miss, or what something in the way makes of the shot, and its derivatives are zero.
     """
@@ -94,6 +94,7 @@ class Aimed(eqx.Module):
         return shots(self, every=every, ax=ax)
 
 
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 def aim_at(
     scene: Scene,
     target: ArrayLike,
@@ -149,14 +150,17 @@ def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -
     else:
         free = Range(shots.scene.having(contacts=()), shots.target, shots.method, shots.steps)
         launch, legal = _implicit(free, speed, lambda: _searched(free, speed, late))
-    flight = shots.flight(launch, save_every=1, record=_height)
+    up = shots.scene.up
+    across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
+    flight = shots.flight(launch, save_every=1, record=_HEIGHTS[up])
     residual = flight.final_scene.state.position - shots.target
-    ok = legal & (norm(residual) <= _tolerance(shots, launch))
+    ok = legal & (norm(residual) <= shots.rounding(launch))
     velocity, time = launch = _fixed_unless(ok, launch)
-    forward = velocity[..., 0] if velocity.shape[-1] == 2 else norm(velocity[..., ::2])
+    level = [velocity[..., axis] for axis in across]
+    forward = level[0] if len(level) == 1 else norm(jnp.stack(level, axis=-1))
     return Shot(
-        angle=jnp.arctan2(velocity[..., 1], forward),
-        azimuth=None if velocity.shape[-1] == 2 else jnp.arctan2(velocity[..., 2], velocity[..., 0]),
+        angle=jnp.arctan2(velocity[..., up], forward),
+        azimuth=None if len(level) == 1 else jnp.arctan2(level[1], level[0]),
         speed=norm(velocity) if speed is None else speed,
         time=time,
         velocity=velocity,
@@ -173,15 +177,9 @@ def _searched(shots: Range, speed: Array | None, late: Array | None) -> tuple[La
         return launch, found
     # without a force to bring it back there is no high arc, and the search for it runs away
     launch = chosen(norm(launch.velocity) > 0.5 * speed, launch, first_guess(shots, speed))
-    too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * _tolerance(shots, launch)
+    too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * shots.rounding(launch)
     launch, _ = nearest(shots, launch, speed, too_fast | ~found)
     return launch, jnp.ones_like(found)
-
-
-def _tolerance(shots: Range, launch: Launch) -> Array:
-    """Rounding errors of a flight of this extent [m]."""
-    extent = norm(shots.offset) + norm(launch.velocity) * launch.time
-    return lax.stop_gradient(ROUNDINGS * float(jnp.finfo(extent.dtype).eps) * extent)
 
 
 def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Launch, Array]:
@@ -221,9 +219,13 @@ def _solved_by_lane(linear: Callable, b: Array) -> Array:
     return jnp.where(sound[..., None], jnp.linalg.solve(matrix, b[..., None])[..., 0], 0.0)
 
 
-def _height(t: Array, state: Any) -> tuple[Array, Array]:
+def _height(t: Array, state: Any, *, up: int) -> tuple[Array, Array]:
     """Height [m] and rate of climb [m/s]."""
-    return state.position[..., 1], state.velocity[..., 1]
+    return state.position[..., up], state.velocity[..., up]
+
+
+_HEIGHTS = [partial(_height, up=axis) for axis in range(3)]
+"""What is recorded of a flight, by the axis that is up; named once, since a new function would compile anew."""
 
 
 def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:

@@ -36,7 +36,8 @@ def find_bounced(
     launches, distance = lax.map(lambda start: nearest(shots, start, speed, wanted), starts)
     right = lax.map(lambda launch: _touches(shots, launch), launches) == bounces
     extent = speed[None] * launches.time
-    hit = right & (distance <= float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent)
+    near = float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent
+    hit = right & (distance <= jnp.maximum(near, shots.rounding(launches)))
     order = jnp.where(late, -launches.time, launches.time)
     # hits come first, by time; then the nearest with the right number of bounces; then the others
     worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0)) + 1
@@ -70,7 +71,7 @@ def _watched_step(scene: Scene, method: Any, t: Array, dt: Array) -> tuple[Scene
 
 def _best_of_fan(shots: Range, speed: Array, bounces: int) -> Launch:
     """The launches of the fan that come nearest, of all that do better than their neighbours; stacked in front."""
-    fan = _directions(shots.target.shape[-1], speed.dtype)
+    fan = _directions(shots.target.shape[-1], shots.scene.up, speed.dtype)
     shape = fan.shape[:2]
     launch = lambda direction: scale(speed, jnp.broadcast_to(direction, shots.target.shape))  # noqa: E731
     rows = fan.reshape(-1, fan.shape[-1])
@@ -89,14 +90,15 @@ def _best_of_fan(shots: Range, speed: Array, bounces: int) -> Launch:
     return Launch(velocity, jax.vmap(lambda chosen: _picked(time, chosen))(best))
 
 
-def _directions(dim: int, dtype: Any) -> Float[Array, "up around dim"]:
+def _directions(dim: int, up: int, dtype: Any) -> Float[Array, "up around dim"]:
     """Unit vectors, evenly around a circle, or on rings from nearly straight down to nearly straight up."""
     around = lambda count: 2 * math.pi / count * (jnp.arange(count, dtype=dtype) + 0.5)  # noqa: E731
     if dim == 2:
         return jnp.stack([jnp.cos(around(CIRCLE)), jnp.sin(around(CIRCLE))], axis=-1)[None]
     rise, turn = 0.5 * (around(RINGS[0]) - math.pi), around(RINGS[1])
     rise, turn = jnp.meshgrid(rise, turn, indexing="ij")
-    return jnp.stack([jnp.cos(rise) * jnp.cos(turn), jnp.sin(rise), jnp.cos(rise) * jnp.sin(turn)], axis=-1)
+    level = [jnp.cos(rise) * jnp.cos(turn), jnp.cos(rise) * jnp.sin(turn)]
+    return jnp.stack([*level[:up], jnp.sin(rise), *level[up:]], axis=-1)
 
 
 def _closest(shots: Range, velocity: Array, speed: Array, bounces: int) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ FRAMES = 32
 
 def height(flight: Trajectory) -> Float[Array, ""]:
     """Greatest height of anything on the way [m]."""
-    return jnp.max(flight.position[..., min(1, flight.position.shape[-1] - 1)])
+    return jnp.max(flight.position[..., flight.scene.up])
 
 
 def distance(flight: Trajectory) -> Float[Array, ""]:

@@ -15,7 +15,7 @@ from physjax.physics import contacts
 from physjax.scene import Scene, as_module
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.reference import in_dtype
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import changing_parts, sample
 from physjax.study.limits import name_of
 from physjax.study.problem import Problem
 
@@ -102,19 +102,22 @@ def random_push(scene: Scene) -> Any:
 
 
 def copies(scene: Scene, count: int) -> Scene:
-    """So many of a scene at once, along a new leading axis of its state and of every number that each lane has."""
+    """So many of a scene at once, along a new leading axis of what a step changes and of every number that each lane has."""
     many = lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape))  # noqa: E731
-    lanes = scene.state.lanes
-    per_lane = lambda leaf: many(leaf) if lanes and eqx.is_array(leaf) and leaf.shape == lanes else leaf  # noqa: E731
-    # what couples lanes, such as springs, has numbers of its own that serve all scenes as they are
-    forces = [f if getattr(f, "couples", True) else jax.tree.map(per_lane, f) for f in scene.forces]
-    parts = {"mass": scene.mass, "pinned": scene.pinned, "contacts": scene.contacts}
-    wider = {name: jax.tree.map(per_lane, part) for name, part in parts.items() if part is not None}
-    wider["forces"] = tuple(forces)
-    if not lanes:
-        memory = lambda contact: jax.tree.map(lambda leaf, c: many(leaf) if c else leaf, contact, contact.changes())  # noqa: E731
-        wider["contacts"] = tuple(memory(contact) for contact in scene.contacts)
-    return scene.having(state=jax.tree.map(many, scene.state), **wider)
+    lanes, remembered = scene.state.lanes, changing_parts(scene, jnp.ones((), scene.state.dtype))
+
+    def wider(part, changes):
+        # what couples lanes, such as springs, has numbers of its own that serve all scenes as they are
+        own = bool(lanes) and not getattr(part, "couples", False)
+        each = lambda leaf, changed: many(leaf) if changed or (own and np.shape(leaf) == lanes) else leaf  # noqa: E731
+        return jax.tree.map(each, part, changes)
+
+    parts = {name: getattr(scene, name) for name in ("mass", "pinned", "emitter")}
+    found = {n: wider(part, getattr(remembered, n)) for n, part in parts.items() if part is not None}
+    for name in ("forces", "contacts"):
+        pairs = zip(getattr(scene, name), getattr(remembered, name), strict=True)
+        found[name] = tuple(wider(part, changes) for part, changes in pairs)
+    return scene.having(state=jax.tree.map(many, scene.state), **found)
 
 
 def title_of(method: Callable) -> str:

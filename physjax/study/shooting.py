@@ -27,6 +27,8 @@ MOST, MOST_DOWNHILL = 40, 100
 """Steps of a search, and of a descent to the nearest miss, after which it is given up."""
 COARSE = 16
 """Steps of a flight while the shot is still far from its target."""
+ROUNDINGS = 512
+"""A target that is missed by no more than so many roundings of the flight's extent is hit."""
 FARTHEST = math.e
 """A search changes the flight time by no more than this factor at once."""
 
@@ -77,6 +79,17 @@ class Range(eqx.Module):
             return self.flight(launch).final_scene.state.position - self.target
         dt = launch.time / steps.astype(launch.time.dtype)
         return sample(self.fired(launch.velocity), self.method, dt, steps, 1).position[1] - self.target
+
+    def rounding(self, launch: Launch) -> Float[Array, "*lanes"]:
+        """What rounding leaves of a miss [m]: of the flight's extent and, far from the origin, of a place at every step.
+
+        A miss beyond the square root of a rounding of the extent is one, wherever the shot is fired.
+        """
+        extent = norm(self.offset) + norm(launch.velocity) * launch.time
+        away = jnp.maximum(norm(self.scene.state.position), norm(self.target))
+        eps = float(jnp.finfo(extent.dtype).eps)
+        left = eps * jnp.maximum(ROUNDINGS * extent, self.steps * away)
+        return lax.stop_gradient(jnp.minimum(left, eps**0.5 * extent))
 
     def sensitivity(self, launch: Launch, directions: list[Launch], steps: Array | None) -> tuple[Array, list[Array]]:
         """The miss [m], and its derivative along each direction."""
@@ -214,7 +227,8 @@ def nearest(
     """The launch that comes nearest the target, from a start on, at a speed, and its distance [m].
 
     The method of Levenberg and Marquardt. Unknown are the direction, as turns about it, and the logarithm of the flight
-    time. Only the `wanted` lanes leave their start, and have a distance that is finite.
+    time. Only the `wanted` lanes leave their start, and have a distance that is finite. A lane is done when its steps
+    are small and, where it hits, when they no longer halve the distance: then only rounding is left of it.
     """
     still, zero = jnp.zeros_like(start.time), jnp.zeros_like(start.velocity)
     steps, least = jnp.array(shots.steps, jnp.int32), 0.1 * float(jnp.finfo(still.dtype).eps) ** 0.5
@@ -229,10 +243,12 @@ def nearest(
         miss, slopes = shots.sensitivity(tried, [*directions, Launch(zero, tried.time)], steps)
         better = norm(miss) < now.distance
         small = (norm(stacked(step)) <= least) & jnp.isfinite(now.distance)
+        # a damped step leaves a share of the miss; the distance of a nearest miss stays, that of a hit goes on falling
+        falls = norm(miss) < 0.5 * now.distance
         after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.going)
         worse = now._replace(damping=3.0 * now.damping)
         after = chosen(better, after, worse)
-        return after._replace(going=~small & (after.damping < 1e8))
+        return after._replace(going=~(small & ~falls) & (after.damping < 1e8))
 
     # the first step is none at all, and finds the slopes
     axes = tuple(jnp.broadcast_to(row, zero.shape) for row in jnp.eye(zero.shape[-1], dtype=zero.dtype))

@@ -1,8 +1,10 @@
 """The loop: frames and time, resuming, one compilation, batches, derivatives, memory, and plain words for bad numbers."""
 
 import math
+import warnings
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physjax import Particles, Scene, forces, lattices, methods, simulate
+from physjax import Particles, Scene, contacts, forces, lattices, methods, simulate
 from physjax.physics.forces import independent
+from physjax.scene import Force
 from physjax.stepping.methods import METHODS
+from physjax.stepping.simulate import state_after
 
 MASS = np.array([0.2, 0.5, 1.0, 2.0, 4.0])
 
@@ -367,3 +371,96 @@ def test_a_cloths_loop_is_compiled_in_pieces(differentiated):
     with_state = [line for line in loops if "[81,3]" in line]
     assert with_state
     assert not [line for line in with_state if "small_call" in line]
+
+
+# looking into a run
+
+
+class Seen(Force):
+    """Drag that notes what it is shown: a number or a tracer."""
+
+    notes: list = eqx.field(static=True)
+
+    def __call__(self, t, state, mass):
+        self.notes.append(isinstance(state.position, jax.core.Tracer))
+        return -0.1 * state.velocity
+
+
+@pytest.mark.parametrize("save_every", [1, 20])
+def test_without_jit_a_force_sees_numbers_and_the_run_is_the_same(save_every):
+    seen = Seen([])
+    ball = Scene(Particles(jnp.zeros(2), jnp.ones(2)), forces=(forces.Gravity(), seen))
+    run = partial(simulate, ball, methods.rk4, dt=0.1, steps=20, save_every=save_every)
+    compiled = run().position[-1]
+    seen.notes.clear()
+    with jax.disable_jit():
+        plain, end = run(), state_after(ball, methods.rk4, dt=0.1, duration=0.4)
+    assert len(seen.notes) == 4 * 24
+    assert not any(seen.notes)
+    np.testing.assert_allclose(plain.position[-1], compiled, rtol=1e-13)
+    assert end.steps == 4
+
+
+def test_a_run_is_not_held_up_by_the_transfer_guard():
+    """What a call is given it sends on purpose; scenes, resumed runs and crossings as well."""
+    start = Particles(jnp.array([0.0, 1.0]), jnp.ones(2))
+    plane = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.project)
+    with jax.transfer_guard("disallow"):
+        scene = Scene(start, 1.0, (forces.Gravity(), forces.QuadraticDrag(0.1, 0.4)), (plane,))
+        run = simulate(scene, methods.verlet, dt=0.1, duration=1.0)
+        rest = simulate(run.final_scene, methods.verlet, dt=0.1, steps=2, first_step=run.final_step)
+        at = run.crossing(0.5)
+    assert rest.final_step == 12
+    assert at.ok
+
+
+# functions made anew
+
+
+def test_a_closure_made_at_every_call_is_told_once():
+    ball = Particles(jnp.zeros(2), jnp.ones(2))
+    thrown = lambda force, **more: simulate(Scene(ball, forces=(force,)), methods.euler, dt=0.1, steps=2, **more)  # noqa: E731
+
+    def pulled(k):
+        return independent(lambda t, state, mass: -k * state.velocity)
+
+    with pytest.warns(UserWarning, match=r"<lambda>.*defined anew at each call.*Define it once") as told:
+        for k in (1.0, 2.0, 3.0):
+            thrown(pulled(k))
+    assert [str(w.filename).endswith("test_simulate.py") for w in told] == [True]
+    with pytest.warns(UserWarning, match=r"keep.*anew"):
+        for k in (1.0, 2.0):
+
+            def keep(t, state):
+                return k * state.position
+
+            thrown(gust_of_wind, record=keep)
+
+
+def gust_of_wind(t, state, mass):
+    return -state.velocity
+
+
+def test_a_function_that_stays_and_one_inside_of_jit_are_not_told():
+    ball = Particles(jnp.zeros(2), jnp.ones(2))
+
+    class Fan:
+        def blow(self, t, state, mass):
+            return -state.velocity
+
+    fan = Fan()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):
+            for force in (gust_of_wind, fan.blow):
+                simulate(Scene(ball, forces=(force,)), methods.euler, dt=0.1, steps=2)
+
+        @jax.jit
+        def both(state):
+            ends = [
+                simulate(Scene(state, forces=(lambda t, s, m: -k * s.velocity,)), methods.euler, dt=0.1, steps=2)
+                for k in (1.0, 2.0)
+            ]
+            return ends[1].position[-1]
+
+        both(ball)

@@ -282,6 +282,33 @@ def test_copies_of_a_scene_move_as_it_does(name):
     np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
 
 
+def ball_in_a_room():
+    """One particle, whose contact remembers since when it touches which wall."""
+    room = contacts.Room((-1.0, 0.0), (1.0, 2.0), restitution=0.8)
+    return Scene(Particles(jnp.array([0.0, 0.3]), jnp.array([3.0, 0.0])), forces=(forces.Gravity(),), contacts=(room,))
+
+
+def balls_in_a_room():
+    """Two, each with a memory and a mass of its own."""
+    one = ball_in_a_room()
+    twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one.state)
+    return Scene(twice, jnp.array([1.0, 2.0]), one.forces, [replace(one.contacts[0], touching_since=None)])
+
+
+def breaking_rope():
+    """Springs that remember which of them broke: the middle one is stretched too far."""
+    rope = lattices.rope((0.0, 0.0), (1.0, 0.0), 4, mass=1.0, stiffness=100.0, breaks_at=0.05)
+    return Scene(Particles(rope.state.position.at[2:, 0].add(0.1), rope.state.velocity), rope.mass, (rope.springs,))
+
+
+@pytest.mark.parametrize("build", [ball_in_a_room, balls_in_a_room, breaking_rope])
+def test_copies_remember_each_on_its_own(build):
+    run = lambda scene: sample(scene, as_module(methods.verlet), 0.02, jnp.asarray(10), frames=4)  # noqa: E731
+    one, many = run(build()), run(copies(build(), 3))
+    assert many.position.shape[1] == 3
+    np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
+
+
 def test_rivals_can_be_chosen():
     assert [type(solver).__name__ for solver in accuracy.default_rivals()] == ["Tsit5", "Dopri8"]
 

@@ -9,7 +9,10 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from physjax import Particles, Scene, aim_at, contacts, forces, methods, reference, simulate
+from physjax.scene import as_module
 from physjax.study import projectile
+from physjax.study.shooting import Launch, Range, nearest
+from physjax.vectors import norm
 
 RNG = np.random.default_rng(7)
 COUNT = 10_000
@@ -305,3 +308,53 @@ def test_what_is_no_scene_or_no_method_is_told(unannotated):
         aim_at("ball", (40.0, 0.0), speed=30.0)
     with pytest.raises(TypeError, match="expected a method"):
         aim_at(ball(), (40.0, 0.0), speed=30.0, method="rk4")
+
+
+# to the last digits
+
+
+def test_the_descent_to_a_hit_ends_at_rounding(precision):
+    """Damped steps leave a share of the miss: it has to go on until nothing but rounding is left."""
+    targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(64, RNG.uniform(0.1, 0.9, 64)))
+    shots = Range(ball(position=jnp.zeros((64, 2), precision.dtype)), targets, as_module(methods.rk4), 32)
+    truth = projectile.angles_for_target(targets[:, 0], targets[:, 1], speed)
+    time = targets[:, 0] / (speed * jnp.cos(truth.low))
+    angle = truth.low + jnp.linspace(-0.05, 0.05, 64, dtype=precision.dtype)
+    start = Launch(speed[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), time)
+    found, distance = jax.jit(nearest)(shots, start, speed, jnp.ones(64, bool))
+    extent = norm(targets) + speed * found.time
+    assert (distance / extent).max() < 8 * precision.eps
+    assert (distance <= shots.rounding(found)).all()
+
+
+def test_far_from_the_origin_a_hit_is_a_hit(precision):
+    """Places are rounded by where they are, at every step; what that leaves of a miss is no miss."""
+    targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(64, RNG.uniform(0.2, 0.9, 64)))
+    far = jnp.full(2, 1000.0, precision.dtype)
+    aimed = aim_at(ball(position=far), far + targets, speed=speed)
+    assert aimed.low.ok.all()
+    assert aimed.high.ok.all()
+    targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(64, 1.01))
+    assert not aim_at(ball(position=far), far + targets, speed=speed).ok.any()
+
+
+def cycled(vector, up):
+    """A vector of a world in which y is up, in one where another axis is."""
+    return jnp.roll(jnp.asarray(vector), up - 1, axis=-1)
+
+
+@pytest.mark.parametrize("up", [0, 2])
+def test_elevation_and_apex_are_along_the_axis_that_is_up(up):
+    """The same shot with the axes exchanged in their cycle; the azimuth is from the first of the other two."""
+    target, weight = (20.0, 3.0, -7.0), forces.Gravity(up=up)
+    usual = aim_at(ball(3, forces.QuadraticDrag(**BASEBALL, wind=(1.0, 0.0, 2.0))), target, speed=25.0)
+    drag = forces.QuadraticDrag(**BASEBALL, wind=cycled((1.0, 0.0, 2.0), up))
+    scene = Scene(Particles(jnp.zeros(3), jnp.zeros(3)), 0.145, (drag, weight))
+    turned = aim_at(scene, cycled(target, up), speed=25.0)
+    assert scene.up == up
+    for ours, theirs in ((turned.low, usual.low), (turned.high, usual.high)):
+        assert ours.ok
+        np.testing.assert_allclose(ours.velocity, cycled(theirs.velocity, up), atol=1e-11)
+        np.testing.assert_allclose([ours.angle, ours.apex], [theirs.angle, theirs.apex], atol=1e-11)
+        level = np.delete(np.asarray(ours.velocity), up)
+        assert ours.azimuth == pytest.approx(math.atan2(level[1], level[0]), abs=1e-12)
