@@ -109,8 +109,8 @@ def copies(scene: Scene, count: int) -> Scene:
     def wider(part, changes):
         # what couples lanes, such as springs, has numbers of its own that serve all scenes as they are
         own = bool(lanes) and not getattr(part, "couples", False)
-        each = lambda leaf, changed: many(leaf) if changed or (own and np.shape(leaf) == lanes) else leaf  # noqa: E731
-        return jax.tree.map(each, part, changes)
+        each = lambda leaf, changed, has_lanes: many(leaf) if changed or (own and has_lanes) else leaf  # noqa: E731
+        return jax.tree.map(each, part, changes, scene.lane_mask(part))
 
     parts = {name: getattr(scene, name) for name in ("mass", "pinned", "emitter")}
     found = {n: wider(part, getattr(remembered, n)) for n, part in parts.items() if part is not None}
