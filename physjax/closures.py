@@ -37,7 +37,7 @@ def warn_of_remade(who: str, functions: Iterable[Any]) -> None:
         _latest[code] = function
         if before != function and code not in _told:
             _told[code] = True
-            warnings.warn(_words(who, code), stacklevel=_depth_of_user())
+            _tell_user(_words(who, code))
 
 
 def _words(who: str, code: CodeType) -> str:
@@ -50,12 +50,12 @@ def _words(who: str, code: CodeType) -> str:
     )
 
 
-def _depth_of_user() -> int:
-    """How many frames above its caller the user's own code is, past ours and what wraps it."""
-    frame, depth = sys._getframe(1), 1
+def _tell_user(words: str) -> None:
+    """Warn at the line of the user's own that led here, past ours and what wraps it."""
+    frame, depth = sys._getframe(), 1
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WRAPPERS:
         frame, depth = frame.f_back, depth + 1
-    return depth
+    warnings.warn(words, stacklevel=depth)
 
 
 def _code_of(function: Any) -> CodeType | None:
