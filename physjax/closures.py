@@ -5,6 +5,7 @@ is compiled for each of them.
 """
 
 import inspect
+import sys
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -15,17 +16,18 @@ from weakref import WeakKeyDictionary
 import jax
 import jax.numpy as jnp
 
+WRAPPERS = {"physjax", "contextlib", "equinox", "jaxtyping", "beartype"}
+"""Whose frames stand between a user's call and the place where it is judged."""
 _latest: WeakKeyDictionary[CodeType, Callable] = WeakKeyDictionary()
 """The function that was last compiled of each piece of code."""
 _told: WeakKeyDictionary[CodeType, bool] = WeakKeyDictionary()
 """The code whose user knows."""
 
 
-def warn_of_remade(who: str, functions: Iterable[Any], *, depth: int = 4) -> None:
+def warn_of_remade(who: str, functions: Iterable[Any]) -> None:
     """Warn, once for each, of a user's function whose code was compiled before as another function.
 
     Only where the call itself compiles: not inside of a user's `jit`, which is compiled once, nor under `disable_jit`.
-    The warning points to the call that is so many frames away, past `simulate` and the guard around it.
     """
     found = [(function, code) for function in functions if (code := _code_of(function)) is not None]
     if not found or jax.config.jax_disable_jit or isinstance(jnp.zeros(()), jax.core.Tracer):
@@ -35,7 +37,7 @@ def warn_of_remade(who: str, functions: Iterable[Any], *, depth: int = 4) -> Non
         _latest[code] = function
         if before != function and code not in _told:
             _told[code] = True
-            warnings.warn(_words(who, code), stacklevel=depth)
+            _tell_user(_words(who, code))
 
 
 def _words(who: str, code: CodeType) -> str:
@@ -46,6 +48,14 @@ def _words(who: str, code: CodeType) -> str:
         "numbers that change, make these the array fields of a module: class Pull(equinox.Module): strength: jax.Array, "
         "with def __call__(self, t, state, mass). Pull(jnp.asarray(2.0)) then compiles once for all strengths."
     )
+
+
+def _tell_user(words: str) -> None:
+    """Warn at the line of the user's own that led here, past ours and what wraps it."""
+    frame, depth = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WRAPPERS:
+        frame, depth = frame.f_back, depth + 1
+    warnings.warn(words, stacklevel=depth)
 
 
 def _code_of(function: Any) -> CodeType | None:

@@ -58,7 +58,7 @@ def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
         )
     if not hasattr(surface, "gap"):
-        warn_of_remade("crossing", [surface], depth=6)
+        warn_of_remade("crossing", [surface])
         surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
 

@@ -3,6 +3,7 @@
 import math
 import warnings
 from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -417,24 +418,27 @@ def test_a_run_is_not_held_up_by_the_transfer_guard():
 # functions made anew
 
 
-def test_a_closure_made_at_every_call_is_told_once():
+def throw(force, **more):
     ball = Particles(jnp.zeros(2), jnp.ones(2))
-    thrown = lambda force, **more: simulate(Scene(ball, forces=(force,)), methods.euler, dt=0.1, steps=2, **more)  # noqa: E731
+    return simulate(Scene(ball, forces=(force,)), methods.euler, dt=0.1, steps=2, **more)
 
-    def pulled(k):
-        return independent(lambda t, state, mass: -k * state.velocity)
 
+def pulled(k):
+    return independent(lambda t, state, mass: -k * state.velocity)
+
+
+def kept(k):
+    return lambda t, state: k * state.position
+
+
+def test_a_closure_made_at_every_call_is_told_once():
+    throw(pulled(1.0), record=kept(1.0))
     with pytest.warns(UserWarning, match=r"<lambda>.*defined anew at each call.*Define it once") as told:
-        for k in (1.0, 2.0, 3.0):
-            thrown(pulled(k))
-    assert [str(w.filename).endswith("test_simulate.py") for w in told] == [True]
-    with pytest.warns(UserWarning, match=r"keep.*anew"):
-        for k in (1.0, 2.0):
-
-            def keep(t, state):
-                return k * state.position
-
-            thrown(gust_of_wind, record=keep)
+        throw(pulled(2.0), record=kept(2.0))
+    assert [Path(one.filename).name for one in told] == ["test_simulate.py"] * 2  # the force, and what is recorded
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        throw(pulled(3.0), record=kept(3.0))
 
 
 def gust_of_wind(t, state, mass):
@@ -442,8 +446,6 @@ def gust_of_wind(t, state, mass):
 
 
 def test_a_function_that_stays_and_one_inside_of_jit_are_not_told():
-    ball = Particles(jnp.zeros(2), jnp.ones(2))
-
     class Fan:
         def blow(self, t, state, mass):
             return -state.velocity
@@ -452,15 +454,6 @@ def test_a_function_that_stays_and_one_inside_of_jit_are_not_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(2):
-            for force in (gust_of_wind, fan.blow):
-                simulate(Scene(ball, forces=(force,)), methods.euler, dt=0.1, steps=2)
-
-        @jax.jit
-        def both(state):
-            ends = [
-                simulate(Scene(state, forces=(lambda t, s, m: -k * s.velocity,)), methods.euler, dt=0.1, steps=2)
-                for k in (1.0, 2.0)
-            ]
-            return ends[1].position[-1]
-
-        both(ball)
+            throw(gust_of_wind)
+            throw(fan.blow)
+        jax.jit(lambda: [throw(partial(lambda k, t, s, m: -k * s.velocity, k)).position for k in (1.0, 2.0)])()

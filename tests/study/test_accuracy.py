@@ -1,12 +1,14 @@
 """Work-precision: orders found, failures kept, truths named, one compilation a method."""
 
 import csv
+from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, contacts, forces, methods, springs
+from physjax import Particles, Scene, contacts, forces, lattices, methods, springs
 from physjax.scene import as_module
 from physjax.scenes import SCENES
 from physjax.show.report import seconds_text

@@ -327,15 +327,16 @@ def test_the_descent_to_a_hit_ends_at_rounding(precision):
     assert (distance <= shots.rounding(found)).all()
 
 
+@pytest.mark.slow
 def test_far_from_the_origin_a_hit_is_a_hit(precision):
     """Places are rounded by where they are, at every step; what that leaves of a miss is no miss."""
     targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(64, RNG.uniform(0.2, 0.9, 64)))
     far = jnp.full(2, 1000.0, precision.dtype)
-    aimed = aim_at(ball(position=far), far + targets, speed=speed)
+    aimed = aim_at(ball(position=far), far[None] + targets, speed=speed)
     assert aimed.low.ok.all()
     assert aimed.high.ok.all()
     targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(64, 1.01))
-    assert not aim_at(ball(position=far), far + targets, speed=speed).ok.any()
+    assert not aim_at(ball(position=far), far[None] + targets, speed=speed).ok.any()
 
 
 def cycled(vector, up):
@@ -343,7 +344,7 @@ def cycled(vector, up):
     return jnp.roll(jnp.asarray(vector), up - 1, axis=-1)
 
 
-@pytest.mark.parametrize("up", [0, 2])
+@pytest.mark.parametrize("up", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_elevation_and_apex_are_along_the_axis_that_is_up(up):
     """The same shot with the axes exchanged in their cycle; the azimuth is from the first of the other two."""
     target, weight = (20.0, 3.0, -7.0), forces.Gravity(up=up)

@@ -82,10 +82,10 @@ def test_bounces_that_cannot_be_are_told():
 def passes_made(ball, bounced_axis, count, seed):
     """Places where random flights are once they have bounced once: right targets, every one of them."""
     random = np.random.default_rng(seed)
-    angle, time = random.uniform(-1.2, 1.4, 8 * count), jnp.asarray(random.uniform(0.3, 2.2, 8 * count))
-    velocity = jnp.asarray(SPEED * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    angle, time = random.uniform(-1.2, 1.4, 8 * count), random.uniform(0.3, 2.2, 8 * count)
+    velocity = jnp.asarray(SPEED * np.stack([np.cos(angle), np.sin(angle)], axis=-1), ball.state.dtype)
     many = Scene(Particles(ball.state.position + 0 * velocity, velocity), ball.mass, ball.forces, ball.contacts)
-    run = simulate(many, methods.rk4, dt=time / 200, steps=200)
+    run = simulate(many, methods.rk4, dt=jnp.asarray(time / 200, velocity.dtype), steps=200)
     kicks = np.abs(np.diff(np.asarray(run.velocity)[..., bounced_axis], axis=0)) > 1.0
     return run.position[-1][kicks.sum(axis=0) == 1][:count]
 
@@ -94,28 +94,21 @@ def passes_made(ball, bounced_axis, count, seed):
 def test_no_right_arc_is_denied(what, precision):
     """Of 200 targets that a bounce leads to: all are hit to rounding, lane by lane and mapped, and move with them."""
     place, normal, axis = {"floor": ((0.0, 0.0), (0.0, 1.0), 1), "board": ((4.0, 0.0), (-1.0, 0.0), 0)}[what]
+    start = jnp.array([0.0, 2.0], precision.dtype)
+    loads = (forces.Gravity(), forces.QuadraticDrag(0.045, 0.3))
+    surface = contacts.Plane(point=place, normal=normal, restitution=0.8)
+    ball = Scene(Particles(start, jnp.zeros_like(start)), 0.6, loads, (surface,))
+    targets = passes_made(ball, axis, 200, 3)
 
-    def aimed(numbers, targets):
-        drag, restitution, speed = (jnp.asarray(number, targets.dtype) for number in numbers)
-        surface = contacts.Plane(point=place, normal=normal, restitution=restitution)
-        start = Particles(jnp.array([0.0, 2.0], targets.dtype), jnp.zeros(2, targets.dtype))
-        loads = (forces.Gravity(), forces.QuadraticDrag(0.045, drag))
-        return aim_at(Scene(start, 0.6, loads, (surface,)), targets, speed=speed, bounces=1)
-
-    def angles(target):
-        shots = aimed((0.3, 0.8, SPEED), target)
+    def aimed(targets):
+        shots = aim_at(ball, targets, speed=SPEED, bounces=1)
         return jnp.stack([shots.low.angle, shots.high.angle]), (shots.low, shots.high)
 
-    thrower = aimed((0.3, 0.8, SPEED), jnp.ones((1, 2), precision.dtype)).shots.scene
-    one = jax.tree.map(lambda leaf: leaf[0] if leaf.ndim == 2 else leaf, thrower.state)
-    floor = contacts.Plane(point=place, normal=normal, restitution=0.8)
-    targets = passes_made(Scene(one, 0.6, thrower.forces, (floor,)), axis, 200, 3).astype(precision.dtype)
     along = jnp.zeros_like(targets).at[:, 0].set(1.0)
-    _, moves, shots = jax.jit(lambda t: jax.jvp(angles, (t,), (along,), has_aux=True))(targets)
+    _, moves, shots = jax.jit(lambda t: jax.jvp(aimed, (t,), (along,), has_aux=True))(targets)
     for shot in shots:
-        extent = np.linalg.norm(targets - one.position, axis=-1) + SPEED * np.asarray(shot.time)
+        extent = np.linalg.norm(targets - start, axis=-1) + SPEED * np.asarray(shot.time)
         assert shot.ok.all()
         assert (np.asarray(shot.miss) / extent).max() < 64 * precision.eps
     assert (np.asarray(moves) != 0).all()
-    mapped = jax.jit(jax.vmap(lambda target: angles(target)[1][0].ok))(targets)
-    assert mapped.all()
+    assert jax.jit(jax.vmap(lambda target: aimed(target)[1][0].ok))(targets).all()
