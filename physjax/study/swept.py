@@ -1,8 +1,6 @@
 """What a sweep returns: values by axis, a status with its reason for each lane, and ways to look at, keep and pass on both."""
 
 import os
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,10 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from physjax.files import replacing
+from physjax.files import read_arrays, replacing
 from physjax.study import chunks
 from physjax.study.axes import Axis, Lanes, leaf_name
 
+_WRITER = "one written by Sweep.save, or a sweep's folder"
 MISSING = "not computed yet"
 """Status -1: lanes of chunks that are not there."""
 
@@ -164,11 +163,11 @@ def load(path: str | os.PathLike) -> Sweep:
     path = Path(path)
     if path.is_dir():
         folder = chunks.found(path)
-        lanes = _lanes(_read(path / "axes.npz"), folder.manifest["design"])
+        lanes = _lanes(read_arrays(path / "axes.npz", _WRITER), folder.manifest["design"])
         if {axis.name: axis.digest for axis in lanes.axes} != folder.manifest["axes"]:
             raise ValueError(f"load: {path / 'axes.npz'} does not hold the axes of this sweep. Use another folder.")
         return Sweep(lanes, tuple(folder.manifest["reasons"]), folder.gathered)
-    arrays = _read(path)
+    arrays = read_arrays(path, _WRITER)
     missing = {"status", "reasons", "design"} - set(arrays)
     if missing:
         raise ValueError(f"load: {path} is not a saved sweep: it lacks {', '.join(sorted(missing))}.")
@@ -176,18 +175,6 @@ def load(path: str | os.PathLike) -> Sweep:
     flat = {name: a for name, a in arrays.items() if name.partition(".")[0] == "value" or name == "status"}
     flat = {name: a.reshape(lanes.count, *a.shape[len(lanes.shape) :]) for name, a in flat.items()}
     return Sweep(lanes, tuple(map(str, arrays["reasons"])), lambda: flat)
-
-
-def _read(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"load: there is no file {path}. Expected one written by Sweep.save, or a sweep's folder."
-        )
-    try:
-        with np.load(path) as archive:
-            return dict(archive)
-    except (ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"load: {path} is damaged or not an .npz file ({error}).") from error
 
 
 def value_names(values: Any) -> list[str]:
