@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from physjax.files import read_arrays, replacing
 from physjax.study import chunks
-from physjax.study.axes import Axis, Lanes, leaf_name
+from physjax.study.axes import DESIGNS, Axis, Lanes, leaf_name
 
 _WRITER = "one written by Sweep.save, or a sweep's folder"
 MISSING = "not computed yet"
@@ -47,6 +47,13 @@ class Sweep:
     reasons: tuple[str, ...]
     source: Callable[[], dict[str, np.ndarray]] = field(repr=False)
     rebuild: Callable[[list], Any] | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: the results themselves, wherever they lie now."""
+        return {"lanes": self.lanes, "reasons": self.reasons, "_flat": self._flat, "values": self.values}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, source=partial(dict, state["_flat"]), rebuild=None)
 
     @cached_property
     def _flat(self) -> dict[str, np.ndarray]:
@@ -173,8 +180,41 @@ def load(path: str | os.PathLike) -> Sweep:
         raise ValueError(f"load: {path} is not a saved sweep: it lacks {', '.join(sorted(missing))}.")
     lanes = _lanes(arrays, str(arrays["design"]))
     flat = {name: a for name, a in arrays.items() if name.partition(".")[0] == "value" or name == "status"}
+    _demand_sweep(path, arrays, lanes, flat)
     flat = {name: a.reshape(lanes.count, *a.shape[len(lanes.shape) :]) for name, a in flat.items()}
     return Sweep(lanes, tuple(map(str, arrays["reasons"])), lambda: flat)
+
+
+def _demand_sweep(path: Path, arrays: dict[str, np.ndarray], lanes: Lanes, flat: dict[str, np.ndarray]) -> None:
+    """Raise a ValueError that names the file and the array which no sweep could have written."""
+
+    def demand(name: str, good: Any, expected: str) -> None:
+        if not np.all(good):
+            shown = (
+                f"{arrays[name].dtype} of shape {arrays[name].shape}" if arrays[name].size > 4 else f"{arrays[name]}"
+            )
+            raise ValueError(
+                f"load: {path}: {name}: got {shown}, expected {expected}. The file is not as it was saved: save the sweep again."
+            )
+
+    demand("design", lanes.design in DESIGNS, " or ".join(DESIGNS))
+    named = [name for name in arrays if name.startswith("axis.")]
+    if not named or len(flat) < 2:
+        raise ValueError(f"load: {path} is not a saved sweep: it lacks {'values' if named else 'axes'}.")
+    for name in named:
+        demand(
+            name, arrays[name].dtype.kind in "biufV" and arrays[name].ndim and len(arrays[name]), "at least one number"
+        )
+        axis = next(axis for axis in lanes.axes if name in axis.arrays)
+        length = lanes.axes[0].length if lanes.design == "zip" else axis.length
+        demand(name, len(arrays[name]) == length, f"{length} values, as many as there are beside it")
+    for name in flat:
+        shape = lanes.shape
+        demand(name, arrays[name].shape[: len(shape)] == shape, f"a shape that begins with that of the axes, {shape}")
+    reasons, status = arrays["reasons"], arrays["status"]
+    demand("reasons", reasons.ndim == 1 and reasons.dtype.kind == "U" and len(reasons), "words")
+    demand("status", status.dtype.kind == "i" and status.shape == lanes.shape, f"whole numbers of shape {lanes.shape}")
+    demand("status", (status >= -1) & (status < len(reasons)), f"-1 to {len(reasons) - 1}, the places of the reasons")
 
 
 def value_names(values: Any) -> list[str]:
