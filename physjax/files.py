@@ -1,12 +1,22 @@
-"""Files and folders that are whole or absent: written under a temporary name beside their place, then renamed."""
+"""Files and folders that are whole or absent: written under a temporary name beside their place, then renamed.
+
+And what is read from them: every array of a saved run is held against what a run can be before it is believed.
+"""
 
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+import numpy as np
+
+RUN_FORMAT = 1
+"""Of the files that `Trajectory.save` writes; those of the first edition do not say theirs, which is this one."""
 
 
 @contextmanager
@@ -70,6 +80,113 @@ def writable_folder(path: str | os.PathLike) -> Path:
     except OSError as error:
         raise OSError(f"cannot write into {folder}: {error.strerror or error}. Choose another folder.") from error
     return folder
+
+
+def read_arrays(path: str | os.PathLike, writer: str) -> dict[str, np.ndarray]:
+    """The arrays of an .npz file by name; FileNotFoundError or a ValueError that says what is wrong with the file."""
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"load: there is no file {file}. Expected {writer}.")
+    try:
+        with np.load(file) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (ValueError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"load: {file} is damaged or not an .npz file ({error}).") from error
+    except AttributeError as error:  # a lone .npy is an array, not an archive
+        raise ValueError(f"load: {file} is damaged or not an .npz file (it holds one array).") from error
+
+
+def demand_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise a ValueError that names the file and the array which no run could have written."""
+    missing = {"time", "ok", "first_step", "save_every", "steps", "method"} - set(arrays)
+    if missing:
+        raise ValueError(f"load: {file} is not a saved run: it lacks {', '.join(sorted(missing))}.")
+
+    def demand(name: str, good: Any, expected: str) -> None:
+        if not np.all(good):
+            array = arrays[name]
+            shown = f"{array}" if array.size < 5 else f"{array.dtype} of shape {array.shape}"
+            raise ValueError(
+                f"load: {file}: {name}: got {shown}, expected {expected}. The file is not as it was saved: save the run again."
+            )
+
+    is_count = lambda name, least: arrays[name].ndim == 0 and arrays[name].dtype.kind in "iu" and arrays[name] >= least  # noqa: E731
+    if "format" in arrays:
+        demand("format", is_count("format", 1), "a whole number from 1 on")
+        demand(
+            "format",
+            arrays["format"] <= RUN_FORMAT,
+            f"at most {RUN_FORMAT}: a newer physjax wrote it, which can load it",
+        )
+    demand("save_every", is_count("save_every", 1), "a whole number from 1 on")
+    demand("steps", is_count("steps", 0), "a whole number of steps")
+    steps, save_every = int(arrays["steps"]), int(arrays["save_every"])
+    demand("steps", steps % save_every == 0, f"a multiple of save_every, {save_every}")
+    demand("method", arrays["method"].dtype.kind == "U" and arrays["method"].ndim == 0, "the name of a method")
+    demand("first_step", arrays["first_step"].dtype.kind in "iu", "whole numbers")
+    demand("ok", arrays["ok"].dtype == bool, "booleans")
+    _demand_frames(arrays, demand, steps // save_every + 1)
+    _demand_times(arrays, demand, steps)
+
+
+def _demand_frames(arrays: Mapping[str, np.ndarray], demand: Any, frames: int) -> None:
+    """As many frames everywhere, behind the axes of a vmap, if there was one; real numbers; finite at the end of a good run."""
+    outside = arrays["first_step"].shape
+    axis, ok = len(outside), arrays["ok"]
+    demand("ok", ok.shape[:axis] == outside, f"a shape that begins with first_step's, {outside}")
+    groups = ("state", "recorded", "parts", "final_state", "final_parts")
+    named = {name: name.partition(".")[0].partition("[")[0] for name in arrays}
+    for name in [name for name in arrays if named[name] in groups or name == "time"]:
+        array = arrays[name]
+        demand(name, array.dtype.kind in "fiubc", "numbers")
+        if name == "time" or named[name] in ("state", "recorded"):
+            right = array.shape[: axis + 1] == (*outside, frames)
+            demand(
+                name,
+                right,
+                f"{frames} frames, as steps and save_every have it: a shape that begins with {(*outside, frames)}",
+            )
+        if named[name] == "state" and ok.all():
+            demand(name, np.isfinite(np.moveaxis(array, axis, 0)[-1]), "finite numbers at the end, since ok is true")
+        if named[name] == "final_state" and ok.all():
+            demand(name, np.isfinite(array), "finite numbers, since ok is true")
+    for group in ("state", "final_state"):
+        if {f"{group}.position", f"{group}.velocity"} <= set(arrays):
+            place, speed = arrays[f"{group}.position"], arrays[f"{group}.velocity"]
+            demand(f"{group}.position", place.dtype.kind == "f", "real numbers")
+            agree = (place.shape, place.dtype) == (speed.shape, speed.dtype)
+            demand(f"{group}.velocity", agree, f"{place.dtype} of shape {place.shape}, as {group}.position")
+    if {"state.position", "final_state.position"} <= set(arrays):
+        last = np.moveaxis(arrays["state.position"], axis, 0)[-1]
+        same = np.array_equal(last, arrays["final_state.position"], equal_nan=True)
+        demand("final_state.position", same, "the position of the last frame")
+    if "state.position" in arrays:
+        lanes = (*outside, *arrays["state.position"].shape[axis + 1 : -1])
+        demand("ok", ok.shape in (lanes, lanes[:-1]), f"one for each lane or scene, {lanes}")
+    if "first_bad_step" in arrays:
+        good = arrays["first_bad_step"].dtype.kind in "iu" and arrays["first_bad_step"].shape == ok.shape
+        demand("first_bad_step", good, f"whole numbers of ok's shape, {ok.shape}")
+
+
+def _demand_times(arrays: Mapping[str, np.ndarray], demand: Any, steps: int) -> None:
+    """Time that goes on, by as much as the steps take; lanes that failed may have failed for their dt."""
+    time, ok, axis = arrays["time"], arrays["ok"], arrays["first_step"].ndim
+    demand("time", time.dtype.kind == "f", "real numbers")
+    if "dt" in arrays:
+        demand("dt", arrays["dt"].dtype.kind == "f", "real numbers")
+        per_frame = time.shape[:axis] + time.shape[axis + 1 :]
+        demand("dt", arrays["dt"].shape == per_frame, f"one for each that has a time of its own, of shape {per_frame}")
+    if not ok.all():
+        return
+    demand("time", np.isfinite(time) & np.all(np.diff(time, axis=axis) >= 0), "finite and ascending numbers")
+    if "dt" in arrays:
+        dt = arrays["dt"].astype(float)
+        demand("dt", np.isfinite(dt) & (dt > 0), "finite numbers > 0")
+        run, rounding = np.moveaxis(time.astype(float), axis, 0), 8 * np.finfo(time.dtype).eps * np.abs(time).max()
+        demand("dt", np.abs(run[-1] - run[0] - steps * dt) <= rounding, f"{steps} steps to take as long as time says")
+        first = arrays["first_step"].astype(float)
+        first = first.reshape(first.shape + (1,) * (dt.ndim - axis))
+        demand("first_step", np.abs(run[0] - first * dt) <= rounding, "the step at which time begins")
 
 
 def _sync_folder(folder: Path) -> None:

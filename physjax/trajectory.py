@@ -1,10 +1,7 @@
 """What a run returns: frames over time, a status per lane, and enough memory of the run to step again inside it."""
 
 import os
-import zipfile
-import zlib
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -16,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete
 from physjax.crossing import Crossing, first_crossing
-from physjax.files import replacing
-from physjax.scene import Function, Particles, Scene, as_module
+from physjax.files import RUN_FORMAT, demand_run, read_arrays, replacing
+from physjax.scene import Contact, Function, Particles, Scene, as_module, changes
 
 
 class Trajectory(eqx.Module):
@@ -41,7 +38,7 @@ class Trajectory(eqx.Module):
     scene: Scene | None
     final_scene: Scene | None
     stepper: Any
-    dt: Float[Array, "..."] | None
+    dt: Float[Array | np.ndarray, "..."] | None
     first_step: Int[Array | np.ndarray, ""]
     save_every: int = eqx.field(static=True)
     steps: int = eqx.field(static=True)
@@ -165,7 +162,7 @@ class Trajectory(eqx.Module):
             (21,)
         """
         arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
-        arrays["method"] = getattr(self.method, "__name__", type(self.method).__name__)
+        arrays |= {"method": _method_name(self.method), "format": RUN_FORMAT}
         if self.dt is not None:
             arrays["dt"] = self.dt
         if self.scene is not None and self.stepper is not None:
@@ -182,8 +179,9 @@ class Trajectory(eqx.Module):
         """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
 
         Without them frames and status are there all the same. What was recorded comes back as an array, or, if it was
-        more than one, as a dict by path. Raises FileNotFoundError, or ValueError for a file that is not a saved run or
-        belongs to another scene.
+        more than one, as a dict by path. A run in float32 takes the given scene's numbers in float32, also where 64-bit
+        types are on, and so goes on as it would have. Raises FileNotFoundError, or ValueError for a file that is not a
+        saved run, has an array that no run could have written, or belongs to another scene, method or precision.
 
         Example:
             >>> flight.save("flight.npz")
@@ -191,17 +189,8 @@ class Trajectory(eqx.Module):
             >>> bool((again.position == flight.position).all())
             True
         """
-        file = Path(path)
-        if not file.is_file():
-            raise FileNotFoundError(f"load: there is no file {file}. Expected a run written by Trajectory.save.")
-        try:
-            with np.load(file) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-        except (ValueError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-            raise ValueError(f"load: {file} is damaged or not an .npz file ({error}).") from error
-        missing = {"time", "ok", "first_step", "save_every", "steps", "method"} - set(arrays)
-        if missing:
-            raise ValueError(f"load: {file} is not a saved run: it lacks {', '.join(sorted(missing))}.")
+        arrays = read_arrays(path, "a run written by Trajectory.save")
+        demand_run(path, arrays)
         return _restored(cls, arrays, scene, method)
 
     def _saved(self) -> dict[str, Any]:
@@ -260,21 +249,37 @@ def _remembers(part: Any) -> bool:
     return hasattr(part, "advance") or bool(getattr(part, "memory", ()))
 
 
+def _method_name(method: Any) -> str:
+    return getattr(method, "__name__", type(method).__name__)
+
+
 def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
     """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
-    ours = "dt" in arrays
-    del arrays["method"]  # a name, for those who read the file with NumPy
-    arrays = {name: jnp.asarray(array) if ours else array for name, array in arrays.items()}
+    ours, made_by = "dt" in arrays, str(arrays.pop("method"))
+    if ours and method is not None and made_by not in (_method_name(method), "NoneType"):
+        raise ValueError(
+            f"load: the run was made with the method {made_by}, got {_method_name(method)}. Give the method it was made "
+            "with; to go on with another one, simulate(run.final_scene, ...)."
+        )
+    if scene is not None and ours:
+        scene = _in_precision(scene, arrays)
+    # a run of float64 without 64-bit types stays in NumPy, where nothing is rounded
+    exact = lambda array: ours and jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype  # noqa: E731
+    floats = [array for array in arrays.values() if array.dtype.kind == "f"]
+    if all(map(exact, floats)):
+        arrays = {name: jnp.asarray(array) if ours else array for name, array in arrays.items()}
     recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
     state = parts = final_scene = None
     if scene is not None and ours:
         final_state = _filled("final_state", scene.state, arrays)
-        final_scene = _remembering(scene, final_state, _filled("final_parts", memories(scene), arrays))
         if final_state.position.shape != scene.state.position.shape:
             raise ValueError(
                 f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
                 "Give the scene the run was made with."
             )
+        final_parts = _filled("final_parts", memories(scene), arrays, shaped=True)
+        _demand_same_contacts(memories(scene), final_parts)
+        final_scene = _remembering(scene, final_state, final_parts)
         parts = () if recorded else _filled("parts", memories(scene), arrays)
     if not recorded:
         state = _filled("state", Particles(0, 0) if scene is None else scene.state, arrays)
@@ -294,8 +299,35 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
     )
 
 
-def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray]) -> Any:
-    """The pytree `like` with its leaves replaced by the file's arrays of that group."""
+def _in_precision(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:
+    """The scene with its numbers in the run's precision, as they were when it was made; ValueError where they are coarser."""
+    run, here = arrays.get("final_state.position", arrays["time"]).dtype, scene.state.dtype
+    if run == here:
+        return scene
+    if jnp.finfo(run).bits > jnp.finfo(here).bits:
+        raise ValueError(
+            f"load: the run is in {run}, the given scene in {here}, too coarse to go on from there. Build the scene in "
+            f'{run}: jax.config.update("jax_enable_x64", True) first.'
+        )
+    return jax.tree.map(lambda leaf: leaf.astype(run) if eqx.is_inexact_array(leaf) else leaf, scene)
+
+
+def _demand_same_contacts(given: tuple, found: tuple) -> None:
+    """Raise a ValueError naming a number of a contact, which never changes, that is another one in the file."""
+    still = [jax.tree.map(lambda changing: not changing, changes(part)) for part in given if isinstance(part, Contact)]
+    pick = lambda parts: [part for part in parts if isinstance(part, Contact)]  # noqa: E731
+    here, there = eqx.filter(pick(given), still), eqx.filter(pick(found), still)
+    for (keys, ours), theirs in zip(jax.tree_util.tree_leaves_with_path(here), jax.tree.leaves(there), strict=True):
+        if concrete(ours) is not None and not np.array_equal(ours, theirs):
+            name = jax.tree_util.keystr(keys, simple=True, separator=".").partition(".")[2]
+            raise ValueError(
+                f"load: the run was made with a contact whose {name} was {np.asarray(theirs)}, in the given scene it is "
+                f"{np.asarray(ours)}. Give the scene the run was made with; to go on with another one, begin from its last frame."
+            )
+
+
+def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> Any:
+    """The pytree `like` with its leaves replaced by the file's arrays of that group, of the same shapes if so `shaped`."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]
     missing = [name for name in names if name not in arrays]
@@ -303,4 +335,10 @@ def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray]) -> Any
         raise ValueError(
             f"load: the file lacks {missing[0]!r}, which the scene has. Give the scene the run was made with."
         )
+    for name, (_, leaf) in zip(names, leaves, strict=True):
+        if shaped and (arrays[name].shape, arrays[name].dtype) != (jnp.shape(leaf), jnp.result_type(leaf)):
+            raise ValueError(
+                f"load: {name}: the file has {arrays[name].dtype} of shape {arrays[name].shape}, the given scene "
+                f"{jnp.result_type(leaf)} of shape {jnp.shape(leaf)}. Give the scene the run was made with."
+            )
     return jax.tree.unflatten(tree, [arrays[name] for name in names])

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, Trajectory, forces, methods, reference, simulate
+from physjax import Particles, Scene, Trajectory, contacts, forces, methods, reference, simulate
 from physjax.stepping.methods import METHODS
+from physjax.trajectory import memories
 from physjax.vectors import scale, upward
 
 RATE, RESERVE, DT = 0.5, 0.8, 0.01
@@ -323,3 +324,105 @@ def test_a_run_of_another_scene_is_refused(flight, tmp_path):
         ValueError, match=r"lacks 'final_parts\[0\]\.push', which the scene has\. Give the scene the run was made with"
     ):
         Trajectory.load(tmp_path / "springs.npz", scene=flight.scene)
+
+
+TAMPERED = {
+    "dt": [
+        (-DT, "finite numbers > 0"),
+        (0.0, "> 0"),
+        (np.nan, "> 0"),
+        (2 * DT, "120 steps to take as long"),
+        (1, "real"),
+    ],
+    "time": [
+        (lambda t: t[::-1], "finite and ascending numbers"),
+        (lambda t: np.where(t > 1.0, np.nan, t), "finite and ascending"),
+        (lambda t: t[:-1], "7 frames, as steps and save_every have it"),
+        (lambda t: t.astype(str), "numbers"),
+    ],
+    "save_every": [(0, "a whole number from 1 on"), (20.0, "a whole number from 1 on"), (10, "7 frames|13 frames")],
+    "steps": [(-120, "a whole number of steps"), (121, "a multiple of save_every, 20"), (140, "8 frames")],
+    "first_step": [(3.0, "whole numbers"), (4, "the step at which time begins")],
+    "ok": [(lambda ok: 1 * ok, "booleans"), (lambda ok: ok[:2], r"one for each lane or scene, \(3,\)")],
+    "method": [(7, "the name of a method")],
+    "format": [(2, "at most 1: a newer physjax wrote it"), (0, "a whole number from 1 on")],
+    "first_bad_step": [(lambda step: step[:1], r"whole numbers of ok's shape, \(3,\)")],
+    "state.position": [
+        (lambda x: x[:5], "7 frames"),
+        (lambda x: x.astype(int), "real numbers"),
+        (lambda x: np.where(np.arange(7)[:, None, None] > 5, np.inf, x), "finite numbers at the end, since ok is true"),
+    ],
+    "state.velocity": [(lambda v: v[..., :1], r"float64 of shape \(7, 3, 2\), as state.position")],
+    "final_state.position": [(lambda x: x + 1e-9, "the position of the last frame")],
+    "final_state.velocity": [(lambda v: v * np.nan, "finite numbers, since ok is true")],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"), [(name, *case) for name, all in TAMPERED.items() for case in all]
+)
+def test_an_array_that_no_run_could_have_written_is_told_by_file_and_name(flight, tmp_path, name, value, expected):
+    flight.save(tmp_path / "run.npz")
+    arrays = dict(np.load(tmp_path / "run.npz"))
+    arrays[name] = value(arrays[name]) if callable(value) else np.asarray(value)
+    np.savez(tmp_path / "other.npz", **arrays)
+    for given in ({}, {"scene": flight.scene, "method": methods.verlet}):
+        with pytest.raises(ValueError, match=rf"load: .*other\.npz: [\w.]+: got .*, expected .*({expected})"):
+            Trajectory.load(tmp_path / "other.npz", **given)
+
+
+def test_a_file_of_the_first_edition_is_read_and_a_memory_of_another_shape_is_not(flight, tmp_path):
+    flight.save(tmp_path / "run.npz")
+    arrays = dict(np.load(tmp_path / "run.npz"))
+    del arrays["format"]
+    np.savez(tmp_path / "old.npz", **arrays)
+    same(Trajectory.load(tmp_path / "old.npz", scene=flight.scene, method=methods.verlet), flight)
+    np.savez(tmp_path / "old.npz", **arrays | {"final_parts[0].fuel": np.ones(2)})
+    with pytest.raises(
+        ValueError, match=r"final_parts\[0\]\.fuel: the file has float64 of shape \(2,\).* of shape \(3,\)"
+    ):
+        Trajectory.load(tmp_path / "old.npz", scene=flight.scene)
+
+
+def test_a_run_of_another_method_or_contact_is_refused(flight, tmp_path):
+    flight.save(tmp_path / "run.npz")
+    with pytest.raises(ValueError, match="made with the method verlet, got rk4"):
+        Trajectory.load(tmp_path / "run.npz", scene=flight.scene, method=methods.rk4)
+    bouncing = lambda k: Scene(  # noqa: E731
+        Particles(jnp.ones(2), jnp.zeros(2)),
+        forces=(forces.Gravity(),),
+        contacts=(contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=k),),
+    )
+    scene = bouncing(0.8)  # put in the place of a scene without contacts, which compiles in a moment
+    run = simulate(Scene(scene.state, forces=scene.forces), methods.verlet, dt=DT, steps=2)
+    final = eqx.tree_at(lambda scene: scene.state, scene, run.final_scene.state)
+    parts = lambda run: (run.scene, run.final_scene, run.parts)  # noqa: E731
+    run = eqx.tree_at(parts, run, (scene, final, memories(scene)))
+    run.save(tmp_path / "bounce.npz")
+    same(Trajectory.load(tmp_path / "bounce.npz", scene=bouncing(0.8)).final_scene, run.final_scene)
+    with pytest.raises(ValueError, match=r"restitution was 0\.8, in the given scene it is 0\.5"):
+        Trajectory.load(tmp_path / "bounce.npz", scene=bouncing(0.5))
+
+
+def test_a_run_of_float32_goes_on_in_a_float64_session_as_it_would_have(tmp_path):
+    """The scene is built anew, in float64, which is what a session with 64-bit types makes of Python's numbers."""
+    build = lambda: rockets((1.0, 1.5), 5.1)  # noqa: E731
+    with jax.enable_x64(False):
+        whole = simulate(build(), methods.verlet, dt=DT, steps=40, save_every=20)
+        simulate(build(), methods.verlet, dt=DT, steps=20, save_every=20).save(tmp_path / "run.npz")
+    half = Trajectory.load(tmp_path / "run.npz", scene=build(), method=methods.verlet)
+    assert half.position.dtype == half.final_scene.state.dtype == half.scene.state.dtype == np.float32
+    rest = simulate(half.final_scene, half.method, dt=half.dt, steps=20, first_step=half.final_step)
+    np.testing.assert_array_equal(rest.position[-1], whole.position[-1])
+    np.testing.assert_array_equal(rest.parts[0].fuel[-1], whole.parts[0].fuel[-1])
+
+
+def test_a_run_of_float64_is_never_rounded(tmp_path):
+    run = simulate(rockets(), methods.verlet, dt=DT, steps=20)
+    run.save(tmp_path / "run.npz")
+    with jax.enable_x64(False):
+        loaded = Trajectory.load(tmp_path / "run.npz")
+        assert loaded.position.dtype == np.float64
+        np.testing.assert_array_equal(loaded.velocity, run.velocity)
+        with pytest.raises(ValueError, match=r"in float64, the given scene in float32.*jax_enable_x64"):
+            Trajectory.load(tmp_path / "run.npz", scene=rockets())

@@ -390,5 +390,6 @@ def _demand_closed(faces: np.ndarray) -> None:
     if bad:
         raise ValueError(
             f"mesh: {len(bad)} of {len(found)} edges, first that from vertex {bad[0][0]} to {bad[0][1]}, have no face on "
-            "the other side that turns the same way; expected a closed surface. Close it, or turn its faces alike."
+            "the other side that turns the same way; expected a closed surface. Close it (meshes.weld "
+            "joins vertices in one place), or turn its faces alike."
         )

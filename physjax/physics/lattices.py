@@ -5,6 +5,7 @@ stiffness is None are absent. `mass` [kg] is that of the whole, and each node ha
 """
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from jax.typing import ArrayLike
 from physjax.checks import positive_integer, real_quantity
 from physjax.physics.aerodynamics import Cells, Triangles, Wind
 from physjax.physics.meshes import checked_mesh, read_mesh
+from physjax.physics.meshes import weld as join_vertices
 from physjax.physics.springs import Springs
 from physjax.scene import Particles
 
@@ -247,11 +249,17 @@ def from_mesh(
     bend: ArrayLike | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
+    weld: float | None = None,
+    triangulate: bool = False,
 ) -> Lattice:
-    """A sheet from `vertices, faces`, or from the path of an .obj or .ply file.
+    """A sheet from `vertices, faces`, or from the path of a file that `meshes.read_mesh` reads (`triangulate` as there).
 
     Structural springs are the edges of the triangles, bend springs tie the vertices opposite each inner edge. A node
     has a third of the area around it. Sets: edge (on the boundary).
+
+    Triangles hold together by the vertices they share. Vertices in one place become one node, with a warning that says
+    how many: those nearer than `weld` [m], unless told a millionth of the mesh's size. With `weld=0` all stay apart.
+    Raises ValueError where no two triangles share a vertex even so.
 
     Example:
         >>> square = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
@@ -262,9 +270,10 @@ def from_mesh(
     if isinstance(mesh, str | os.PathLike):
         if faces is not None:
             raise TypeError("from_mesh: got a file and faces, expected a file alone, or vertices and faces.")
-        x, faces = read_mesh(mesh)
+        x, faces = read_mesh(mesh, triangulate=triangulate)
     else:
         x, faces = checked_mesh(mesh, faces)
+    x, faces = _welded(x, faces, weld)
     edges, opposite, lonely = _edges(faces)
     a, b, c = (x[faces[:, i]] for i in range(3))
     area = _length(np.cross(b - a, c - a)) / 2
@@ -276,6 +285,32 @@ def from_mesh(
         )
     sets = {"edge": np.isin(np.arange(len(x)), lonely)}
     return _built(x, [(edges, structural), (opposite, bend)], damping, breaks_at, mass, share, sets, faces, None)
+
+
+def _welded(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with one node for each place; says what was joined, and refuses what falls apart into single triangles."""
+    if tolerance is not None:
+        tolerance = float(real_quantity("weld [m]", tolerance, at_least=0))
+        if tolerance == 0:
+            return x, faces
+    found = join_vertices(x, faces, tolerance)
+    if len(found.vertices) < len(x):
+        left_out = f", {found.flat} faces without area were left out" if found.flat else ""
+        warnings.warn(
+            f"from_mesh: {len(x)} vertices stand in {len(found.vertices)} places and were welded to as many nodes{left_out}; "
+            "nodes are numbered anew. Weld it first with meshes.weld, or keep the vertices apart with weld=0.",
+            stacklevel=3,
+        )
+    if len(found.faces) == 0:
+        raise ValueError(
+            f"from_mesh: got weld {tolerance} m, which leaves no triangle. Give a length below those of the edges."
+        )
+    if len(found.faces) > 1 and np.bincount(found.faces.ravel()).max() == 1:
+        raise ValueError(
+            f"from_mesh: none of the {len(found.faces)} triangles shares a vertex with another, so that the sheet would fall "
+            "apart. Give weld=, a distance [m] within which vertices are one; weld=0 if they are to be single triangles."
+        )
+    return found.vertices, found.faces
 
 
 def _length(v: np.ndarray) -> np.ndarray:

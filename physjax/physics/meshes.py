@@ -1,43 +1,47 @@
-"""Triangle meshes from OBJ and PLY files: a small reader that refuses what it does not understand."""
+"""Triangle meshes from files, checked, and welded where faces do not share the vertices in which they meet."""
 
 import os
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-_KINDS = {
-    **{name: "i1" for name in ("char", "int8")},
-    **{name: "u1" for name in ("uchar", "uint8")},
-    **{name: "i2" for name in ("short", "int16")},
-    **{name: "u2" for name in ("ushort", "uint16")},
-    **{name: "i4" for name in ("int", "int32")},
-    **{name: "u4" for name in ("uint", "uint32")},
-    **{name: "f4" for name in ("float", "float32")},
-    **{name: "f8" for name in ("double", "float64")},
-}
-_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+from physjax.physics.mesh_files import Polygons, read_obj, read_ply
+
+_OURS = {".obj": read_obj, ".ply": read_ply}
+_THEIRS = (".stl", ".glb", ".gltf")
+"""Endings of files that trimesh reads, where it is installed."""
+CLOSE = 1e-6
+"""Vertices that are nearer than this, relative to the size of a mesh, are one, unless an edge is as short."""
 
 
-def read_mesh(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices `(n, 3)` and triangles `(m, 3)` of an .obj or .ply file.
+def read_mesh(path: str | os.PathLike, *, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices `(n, 3)` and triangles `(m, 3)` of an .obj or .ply file; with trimesh also .stl, .glb and .gltf.
 
-    Raises FileNotFoundError, or ValueError for a file that is truncated, not a mesh, or has faces that are no triangles.
+    With `triangulate` faces of more corners are cut into triangles, fans around their first corner; else they are refused.
+    What trimesh reads is welded, since STL never and GLB seldom shares vertices. Raises FileNotFoundError, ImportError
+    without trimesh, or ValueError for a file that is truncated, not a mesh, or not understood in full.
     """
     file = Path(path)
-    readers = {".obj": _read_obj, ".ply": _read_ply}
-    if file.suffix.lower() not in readers:
-        raise ValueError(f"mesh: got {file.name}, expected a file that ends in {' or '.join(readers)}.")
+    ending = file.suffix.lower()
+    if ending not in _OURS and ending not in _THEIRS:
+        raise ValueError(
+            f"mesh: got {file.name}, expected a file that ends in {' or '.join(_OURS)}, or with trimesh {', '.join(_THEIRS)}."
+        )
     if not file.is_file():
         raise FileNotFoundError(f"mesh: there is no file {file}.")
-    vertices, faces = readers[file.suffix.lower()](file)
-    return checked_mesh(vertices, faces, file.name)
+    if ending in _THEIRS:
+        welded = weld(*checked_mesh(*_read_with_trimesh(file), file.name))
+        return welded.vertices, welded.faces
+    vertices, polygons = _OURS[ending](file, triangulate)
+    return checked_mesh(vertices, _triangles(polygons), file.name)
 
 
 def checked_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles as arrays, or a ValueError that says what is wrong with them."""
     vertices, faces = np.asarray(vertices), np.asarray(faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.issubdtype(vertices.dtype, np.number):
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "iuf":
         raise ValueError(f"{name}: got vertices of shape {vertices.shape}, expected numbers of shape (vertices, 3).")
     if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(
@@ -59,113 +63,79 @@ def checked_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndar
     return vertices.astype(float), faces.astype(np.int64)
 
 
-def _read_obj(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Lines `v x y z` and `f a b c`, each a, a/t, a//n or a/t/n, counted from 1 or, if negative, back from the last."""
-    vertices, faces = [], []
-    for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        kind, *words = line.split("#")[0].split() or [""]
-        if kind not in ("v", "f"):
-            continue
-        try:
-            if kind == "v":
-                vertices.append([float(word) for word in words[:3]])
-            else:
-                corners = [int(word.split("/")[0]) for word in words]
-                faces.append([c - 1 if c > 0 else len(vertices) + c for c in corners])
-        except ValueError as error:
-            raise ValueError(f"{file.name}: line {number} is not a mesh's: {line[:60]!r}.") from error
-        if len(words) < 3 or (kind == "f" and len(words) != 3):
-            wanted = (
-                "a vertex needs 3 numbers" if kind == "v" else "faces must be triangles. Triangulate the mesh first"
-            )
-            raise ValueError(f"{file.name}: line {number} has {len(words)} entries: {wanted}.")
-    if not vertices or not faces:
-        raise ValueError(f"{file.name}: found {len(vertices)} vertices and {len(faces)} faces, expected a mesh.")
-    return np.array(vertices), np.array(faces)
+class Welded(NamedTuple):
+    """Vertices and triangles without vertices that stand in one place; `index[i]` is the vertex that i has become.
+
+    `flat` triangles had two corners in one place and are left out.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    index: np.ndarray
+    flat: int
 
 
-def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Elements `vertex` (with x, y, z) and `face` (a list of 3 indices), as text or binary of either order."""
+def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> Welded:
+    """One vertex instead of several that are nearer than `tolerance` [m]; the first of them stays, in its order.
+
+    Unless told, that is a millionth of the mesh's size, or a tenth of its shortest edge where that is less.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    vertices, faces = checked_mesh(vertices, faces)
+    count = len(vertices)
+    if tolerance is None:
+        edges = np.sqrt(((vertices[faces] - vertices[np.roll(faces, 1, axis=1)]) ** 2).sum(axis=-1))
+        size = np.sqrt((np.ptp(vertices, axis=0) ** 2).sum())
+        tolerance = min(CLOSE * size, edges[edges > CLOSE**2 * size].min(initial=np.inf) / 10)
+    pairs = KDTree(vertices).query_pairs(tolerance, output_type="ndarray")
+    _, group = connected_components(coo_array((np.ones(len(pairs)), pairs.T), (count, count)), directed=False)
+    _, first, group = np.unique(group, return_index=True, return_inverse=True)
+    place = np.empty_like(first)
+    place[np.argsort(first)] = np.arange(len(first))
+    index = place[group.reshape(-1)]
+    joined = index[faces]
+    flat = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+    return Welded(vertices[np.sort(first)], joined[~flat], index, int(flat.sum()))
+
+
+def _triangles(polygons: Polygons) -> np.ndarray:
+    """Faces as triangles: those of more corners as fans around their first."""
+    if all(len(polygon) == 3 for polygon in polygons):
+        return np.array(polygons, np.int64)
+    return np.array([(p[0], p[i], p[i + 1]) for p in polygons for i in range(1, len(p) - 1)], np.int64)
+
+
+def _read_with_trimesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of all parts of a file, each where it stands."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError(f"mesh: {file.name} needs trimesh: pip install 'physjax[mesh]'.") from error
+    if file.suffix.lower() == ".stl":
+        _demand_whole_stl(file)
+    try:
+        mesh = trimesh.load_mesh(file, process=False)
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    except Exception as error:  # of many kinds, none of which is for its callers
+        raise ValueError(f"{file.name}: trimesh cannot read it ({type(error).__name__}: {error}).") from error
+    if not len(faces):
+        raise ValueError(f"{file.name}: found {len(vertices)} vertices and no faces, expected a mesh.")
+    return vertices, faces
+
+
+def _demand_whole_stl(file: Path) -> None:
+    """Raise a ValueError for an STL file that is cut short, of which trimesh reads what is left."""
     content = file.read_bytes()
-    head, mark, body = content.partition(b"end_header\n")
-    if b"\r" in head:
-        head, mark, body = content.partition(b"end_header\r\n")
-    lines = head.decode("ascii", errors="replace").split("\n")
-    if lines[0].strip() != "ply" or not mark:
-        raise ValueError(f"{file.name}: is not a PLY file, or its header is truncated.")
-    order, elements = _ply_header(file.name, [line.split() for line in lines[1:] if line.strip()])
-    words, found = body.split() if order == "" else body, {}
-    for name, count, properties in elements:
-        found[name], words = (_text if order == "" else _binary)(file.name, words, name, count, properties, order)
-    if not {"vertex", "face"} <= set(found):
-        raise ValueError(f"{file.name}: has the elements {sorted(found)}, expected vertex and face.")
-    lists = [values for values in found["face"].values() if values.ndim == 2]
-    if {"x", "y", "z"} - set(found["vertex"]) or len(lists) != 1:
-        raise ValueError(f"{file.name}: expected vertices with x, y and z, and faces with one list of vertices.")
-    return np.stack([found["vertex"][axis] for axis in "xyz"], axis=-1), lists[0]
-
-
-def _ply_header(name: str, lines: list[list[str]]) -> tuple[str, list]:
-    """The byte order and, for each element, its name, count and properties (name, kind, kind of its length or None)."""
-    order, elements = None, []
-    try:
-        for line in lines:
-            if line[0] == "format":
-                order = _ORDERS[line[1]]
-            elif line[0] == "element":
-                elements.append((line[1], int(line[2]), []))
-            elif line[0] == "property" and line[1] == "list":
-                elements[-1][2].append((line[4], _KINDS[line[3]], _KINDS[line[2]]))
-            elif line[0] == "property":
-                elements[-1][2].append((line[2], _KINDS[line[1]], None))
-    except (KeyError, IndexError, ValueError) as error:
-        raise ValueError(f"{name}: does not understand the header line {' '.join(line)!r}.") from error
-    if order is None:
-        raise ValueError(f"{name}: the header does not say its format.")
-    return order, elements
-
-
-def _row(name: str, element: str, properties: list, order: str) -> np.dtype:
-    """A record of an element whose lists all hold three entries; only faces may have lists."""
-    fields = []
-    for title, kind, length in properties:
-        if length is not None and element != "face":
-            raise ValueError(f"{name}: does not understand lists in the element {element!r}.")
-        fields += (
-            [(title, order + kind)] if length is None else [(f"#{title}", order + length), (title, order + kind, 3)]
+    told = int.from_bytes(content[80:84], "little")
+    if len(content) == 84 + 50 * told:
+        return
+    words = re.findall(rb"\b(endfacet|vertex|endsolid|facet)\b", content)
+    facets, corners = words.count(b"facet"), words.count(b"vertex")
+    if not content.lstrip().startswith(b"solid") or words[-1:] != [b"endsolid"] or corners != 3 * facets:
+        raise ValueError(
+            f"{file.name}: is not an STL file, or truncated: as a binary one it has {len(content)} bytes and says {told} "
+            f"triangles, as text it has {facets} facets with {corners} vertices."
         )
-    return np.dtype(fields)
-
-
-def _binary(name, body, element, count, properties, order):
-    row = _row(name, element, properties, order)
-    if len(body) < count * row.itemsize:
-        raise ValueError(f"{name}: is truncated, or its faces are no triangles: {element} {count} does not fit.")
-    table = np.frombuffer(body, row, count)
-    return _columns(name, element, table), body[count * row.itemsize :]
-
-
-def _text(name, words, element, count, properties, order):
-    row = _row(name, element, properties, "<")
-    width = sum(int(np.prod(row[title].shape, dtype=int)) for title in row.names)
-    if len(words) < count * width:
-        raise ValueError(f"{name}: is truncated, or its faces are no triangles: {element} {count} does not fit.")
-    try:
-        numbers = np.array(words[: count * width], float).reshape(count, width)
-    except ValueError as error:
-        raise ValueError(f"{name}: holds something that is not a number in the element {element!r}.") from error
-    table, at = np.empty(count, row), 0
-    for title in row.names:
-        size = int(np.prod(row[title].shape, dtype=int))
-        table[title] = numbers[:, at : at + size].reshape((count, *row[title].shape))
-        at += size
-    return _columns(name, element, table), words[count * width :]
-
-
-def _columns(name: str, element: str, table: np.ndarray) -> dict[str, np.ndarray]:
-    for title in table.dtype.names:
-        if title.startswith("#") and (table[title] != 3).any():
-            raise ValueError(
-                f"{name}: has a {element} with {table[title][table[title] != 3][0]} corners, expected triangles."
-            )
-    return {title: table[title] for title in table.dtype.names if not title.startswith("#")}

@@ -22,6 +22,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from physjax.stepping.blocks import BLOCK
 from physjax.stepping.simulate import WIDE
 from physjax.study.axes import leaf_name
+from physjax.study.callbacks import host_calls, inside, lasting_digest
 from physjax.trajectory import Trajectory
 
 CARRIED = 64 * BLOCK
@@ -53,19 +54,30 @@ class Traced(NamedTuple):
 
     `values` is the tree of the values, with shapes and dtypes in its leaves; status k means `reasons[k]`, 0 is good.
     `carried` and `peak` are the bytes that its loops carry, and that are alive at a time, at most. `digest` is a hash of
-    the program with the constants it closes over.
+    the program with the constants it closes over, `calls` what it calls outside of itself, which no hash of it tells.
     """
 
     jaxpr: ClosedJaxpr
     values: Any
     reasons: tuple[str, ...]
     digest: str
+    calls: tuple[tuple[str, Any], ...] = ()
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Traced) and self.digest == other.digest
+        # functions that are called back must be the very same: equal ones may close over arrays that change later
+        return isinstance(other, Traced) and self._key == other._key
 
     def __hash__(self) -> int:
-        return hash(self.digest)
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple:
+        return (self.digest, *((kind, id(called)) for kind, called in self.calls))
+
+    @property
+    def lasting_digest(self) -> str:
+        """A hash by which another process knows the same measure; ValueError where it calls what has none."""
+        return lasting_digest(self.digest, self.calls)
 
     @property
     def carried(self) -> int:
@@ -112,7 +124,8 @@ def traced(measure: Callable, point: Any) -> Traced:
     values, reasons = seen[-1]
     if not jax.tree.leaves(values):
         raise ValueError(f"measure: {_name(measure)} returned {values!r}, expected at least one number.")
-    return Traced(jaxpr, values, reasons, _digest(jaxpr, leaves))
+    digest, calls = _digest(jaxpr, leaves)
+    return Traced(jaxpr, values, reasons, digest, calls)
 
 
 def layout(
@@ -208,12 +221,21 @@ def _at(path: tuple) -> str:
     return f" (at {leaf_name(path)})" if path else ""
 
 
-def _digest(jaxpr: ClosedJaxpr, leaves: list) -> str:
-    """A hash of what is computed, with the constants that it closes over, whatever the code is called and looks like."""
-    found = hashlib.sha256(jax.jit(jaxpr_as_fun(jaxpr)).lower(*leaves).as_text().encode())
+def _digest(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
+    """A hash of what is computed, with the constants that it closes over, whatever the code is called and looks like.
+
+    And what the program calls outside of itself, of which its text has no more than a number.
+    """
+    text = jax.jit(jaxpr_as_fun(jaxpr)).lower(*leaves).as_text()
+    found = hashlib.sha256(text.encode())
     for constant in jaxpr.consts:
+        if jnp.issubdtype(getattr(constant, "dtype", float), jax.dtypes.prng_key):
+            constant = jax.random.key_data(constant)
         found.update(np.asarray(constant).tobytes())
-    return found.hexdigest()
+    calls = tuple(host_calls(jaxpr.jaxpr))
+    if not calls and "python" in text and "callback" in text:
+        calls = (("unknown", None),)
+    return found.hexdigest(), calls
 
 
 def _name(measure: Callable) -> str:
@@ -250,19 +272,13 @@ def _bytes(variables: Sequence[Any]) -> int:
     return sum(math.prod(aval.shape) * getattr(aval.dtype, "itemsize", 8) for aval in sized)
 
 
-def _inside(equation: Any) -> list[Jaxpr]:
-    """The programs that an operation runs: bodies of loops, branches, functions."""
-    found = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda p: isinstance(p, Jaxpr | ClosedJaxpr))
-    return [p.jaxpr if isinstance(p, ClosedJaxpr) else p for p in found if isinstance(p, Jaxpr | ClosedJaxpr)]
-
-
 def _most_carried(jaxpr: Jaxpr) -> int:
     """Bytes that a turn of any loop hands on, at most: what it carries, and what it stacks."""
     most = 0
     for equation in jaxpr.eqns:
-        inside = _inside(equation)
-        loops = inside if equation.primitive.name in ("scan", "while") else []
-        most = max([most, *(_bytes(body.outvars) for body in loops), *map(_most_carried, inside)])
+        bodies = inside(equation)
+        loops = bodies if equation.primitive.name in ("scan", "while") else []
+        most = max([most, *(_bytes(body.outvars) for body in loops), *map(_most_carried, bodies)])
     return most
 
 
@@ -273,8 +289,7 @@ def _peak(jaxpr: Jaxpr) -> int:
     alive, most = _bytes(jaxpr.invars), 0
     for i, equation in enumerate(jaxpr.eqns):
         alive += _bytes(equation.outvars)
-        inside = max(map(_peak, _inside(equation)), default=0)
-        most = max(most, alive + inside)
+        most = max(most, alive + max(map(_peak, inside(equation)), default=0))
         used = {v for v in equation.invars if not isinstance(v, Literal)}
         alive -= _bytes([v for v in used if last[v] == i and v not in kept])
         alive -= _bytes([v for v in equation.outvars if v not in last and v not in kept])

@@ -1,21 +1,20 @@
 """What a sweep returns: values by axis, a status with its reason for each lane, and ways to look at, keep and pass on both."""
 
 import os
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from physjax.files import replacing
+from physjax.files import read_arrays, replacing
 from physjax.study import chunks
-from physjax.study.axes import Axis, Lanes, leaf_name
+from physjax.study.axes import DESIGNS, Axis, Lanes, leaf_name
 
+_WRITER = "one written by Sweep.save, or a sweep's folder"
 MISSING = "not computed yet"
 """Status -1: lanes of chunks that are not there."""
 
@@ -48,6 +47,13 @@ class Sweep:
     reasons: tuple[str, ...]
     source: Callable[[], dict[str, np.ndarray]] = field(repr=False)
     rebuild: Callable[[list], Any] | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: the results themselves, wherever they lie now."""
+        return {"lanes": self.lanes, "reasons": self.reasons, "_flat": self._flat, "values": self.values}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, source=partial(dict, state["_flat"]), rebuild=None)
 
     @cached_property
     def _flat(self) -> dict[str, np.ndarray]:
@@ -164,30 +170,51 @@ def load(path: str | os.PathLike) -> Sweep:
     path = Path(path)
     if path.is_dir():
         folder = chunks.found(path)
-        lanes = _lanes(_read(path / "axes.npz"), folder.manifest["design"])
+        lanes = _lanes(read_arrays(path / "axes.npz", _WRITER), folder.manifest["design"])
         if {axis.name: axis.digest for axis in lanes.axes} != folder.manifest["axes"]:
             raise ValueError(f"load: {path / 'axes.npz'} does not hold the axes of this sweep. Use another folder.")
         return Sweep(lanes, tuple(folder.manifest["reasons"]), folder.gathered)
-    arrays = _read(path)
+    arrays = read_arrays(path, _WRITER)
     missing = {"status", "reasons", "design"} - set(arrays)
     if missing:
         raise ValueError(f"load: {path} is not a saved sweep: it lacks {', '.join(sorted(missing))}.")
     lanes = _lanes(arrays, str(arrays["design"]))
     flat = {name: a for name, a in arrays.items() if name.partition(".")[0] == "value" or name == "status"}
+    _demand_sweep(path, arrays, lanes, flat)
     flat = {name: a.reshape(lanes.count, *a.shape[len(lanes.shape) :]) for name, a in flat.items()}
     return Sweep(lanes, tuple(map(str, arrays["reasons"])), lambda: flat)
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"load: there is no file {path}. Expected one written by Sweep.save, or a sweep's folder."
+def _demand_sweep(path: Path, arrays: dict[str, np.ndarray], lanes: Lanes, flat: dict[str, np.ndarray]) -> None:
+    """Raise a ValueError that names the file and the array which no sweep could have written."""
+
+    def demand(name: str, good: Any, expected: str) -> None:
+        if not np.all(good):
+            shown = (
+                f"{arrays[name].dtype} of shape {arrays[name].shape}" if arrays[name].size > 4 else f"{arrays[name]}"
+            )
+            raise ValueError(
+                f"load: {path}: {name}: got {shown}, expected {expected}. The file is not as it was saved: save the sweep again."
+            )
+
+    demand("design", lanes.design in DESIGNS, " or ".join(DESIGNS))
+    named = [name for name in arrays if name.startswith("axis.")]
+    if not named or len(flat) < 2:
+        raise ValueError(f"load: {path} is not a saved sweep: it lacks {'values' if named else 'axes'}.")
+    for name in named:
+        demand(
+            name, arrays[name].dtype.kind in "biufV" and arrays[name].ndim and len(arrays[name]), "at least one number"
         )
-    try:
-        with np.load(path) as archive:
-            return dict(archive)
-    except (ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"load: {path} is damaged or not an .npz file ({error}).") from error
+        axis = next(axis for axis in lanes.axes if name in axis.arrays)
+        length = lanes.axes[0].length if lanes.design == "zip" else axis.length
+        demand(name, len(arrays[name]) == length, f"{length} values, as many as there are beside it")
+    for name in flat:
+        shape = lanes.shape
+        demand(name, arrays[name].shape[: len(shape)] == shape, f"a shape that begins with that of the axes, {shape}")
+    reasons, status = arrays["reasons"], arrays["status"]
+    demand("reasons", reasons.ndim == 1 and reasons.dtype.kind == "U" and len(reasons), "words")
+    demand("status", status.dtype.kind == "i" and status.shape == lanes.shape, f"whole numbers of shape {lanes.shape}")
+    demand("status", (status >= -1) & (status < len(reasons)), f"-1 to {len(reasons) - 1}, the places of the reasons")
 
 
 def value_names(values: Any) -> list[str]:

@@ -208,7 +208,7 @@ def test_meshes_are_read_from_files_and_truncated_ones_refused(tmp_path, kind):
         ("a.ply", "hello\n", r"a.ply: is not a PLY file"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n0\n", r"header line 'property quad x'"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", r"expected vertex and face"),
-        ("a.stl", "solid\n", r"ends in .obj or .ply"),
+        ("a.step", "solid\n", r"ends in .obj or .ply"),
     ],
 )  # fmt: skip
 def test_files_that_are_no_meshes_are_refused(tmp_path, name, content, message):

@@ -1,6 +1,7 @@
 """Sweeps: every lane as it is alone, one compilation, failures that stay where they are, plain words for bad input."""
 
 import math
+import pickle
 from typing import NamedTuple
 
 import jax
@@ -334,3 +335,53 @@ def test_progress_counts_lanes(capsys):
     told = capsys.readouterr().err
     assert "35.0/35.0" in told
     assert "lane/s" in told
+
+
+class Pair(NamedTuple):
+    sum: jax.Array
+    product: jax.Array
+
+
+def paired(x, y):
+    return Pair(x + y, jnp.stack([x, y]) * x * y)
+
+
+def test_a_sweep_can_be_pickled_from_memory_from_a_folder_and_from_a_file(tmp_path):
+    axes = {"x": np.linspace(0.0, 1.0, 3), "y": np.linspace(1.0, 2.0, 4)}
+    kept = sweep(paired, axes, progress=False)
+    kept.save(tmp_path / "kept.npz")
+    for found in (kept, sweep(paired, axes, progress=False, out=tmp_path / "out"), sweep.load(tmp_path / "kept.npz")):
+        again = pickle.loads(pickle.dumps(pickle.loads(pickle.dumps(found))))
+        assert jax.tree.structure(again.values) == jax.tree.structure(found.values)
+        for a, b in zip(
+            jax.tree.leaves((again.values, again.axes)), jax.tree.leaves((found.values, axes)), strict=True
+        ):
+            np.testing.assert_array_equal(a, b)
+        assert again.ok.all()
+        assert again.reason((0, 0)) == "ok"
+        assert again.best("sum").point == {"x": 0.0, "y": 1.0}
+        again.save(tmp_path / "again.npz")
+        np.testing.assert_array_equal(sweep.load(tmp_path / "again.npz").values["sum"], kept.values.sum)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("status", lambda s: s + 7, r"expected -1 to 2, the places of the reasons"),
+        ("status", lambda s: s.astype(float), r"expected whole numbers of shape \(3, 4\)"),
+        ("status", lambda s: s[:2], r"expected a shape that begins with that of the axes, \(3, 4\)"),
+        ("value.sum", lambda v: v.T, r"expected a shape that begins with that of the axes, \(3, 4\)"),
+        ("axis.x", lambda x: x[:2], r"expected a shape that begins with that of the axes, \(2, 4\)"),
+        ("axis.x", lambda x: x[0], r"expected at least one number"),
+        ("design", lambda _: "spiral", r"got spiral, expected grid or zip"),
+        ("reasons", lambda r: np.arange(len(r)), r"expected words"),
+    ],
+)
+def test_an_array_that_no_sweep_could_have_written_is_told_by_file_and_name(name, value, expected, tmp_path):
+    axes = {"x": np.linspace(0.0, 1.0, 3), "y": np.linspace(1.0, 2.0, 4)}
+    sweep(paired, axes, progress=False).save(tmp_path / "kept.npz")
+    arrays = dict(np.load(tmp_path / "kept.npz"))
+    arrays[name] = np.asarray(value(arrays[name]))
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(ValueError, match=rf"load: .*other\.npz: .*{expected}"):
+        sweep.load(tmp_path / "other.npz")
