@@ -13,8 +13,10 @@ from physjax.vectors import (
     norm,
     over,
     reverse,
+    root_and_inverse,
     scale,
     spin,
+    square_root,
     stacked,
     turn,
     turn_back,
@@ -42,6 +44,8 @@ def everything(a, b, flat, number, vector, amount):
         "dot in the plane": dot(flat, turn_left(flat) + flat),
         "components": components(a)[1],
         "stacked": stacked(components(a)),
+        "square_root": square_root(dot(a, a)),
+        "root_and_inverse": stacked(list(root_and_inverse(dot(a, a)))),
         "norm": norm(a),
         "unit": unit(a),
         "cross": cross(a, b),
@@ -80,6 +84,8 @@ def expected(a, b, flat, number, vector, amount):
         "components": (a[:, 1], 0.0),
         "stacked": (a, 0.0),
         "dot in the plane": (np.sum(flat * flat, axis=-1), 2 * np.sum(flat * flat, axis=-1)),
+        "square_root": (length, length),
+        "root_and_inverse": (np.stack([length, 1 / length], axis=-1), np.stack([length, 1 / length], axis=-1)),
         "norm": (length, length),
         "unit": (a / length[:, None], 1.0),
         "cross": (np.cross(a, b), products),
@@ -178,6 +184,19 @@ def test_the_second_derivative_of_the_norm_is_the_projector_over_the_length():
     length = np.linalg.norm(v)
     projector = (np.eye(3) - np.outer(v, v) / length**2) / length
     np.testing.assert_allclose(jax.jit(jax.hessian(norm))(jnp.asarray(v)), projector, rtol=0, atol=1e-15)
+
+
+def test_second_derivatives_in_a_loop_are_zero_at_zero_in_any_nesting_of_the_modes():
+    """A loop in reverse mode drops the rules for derivatives, so what they give must not be what makes them right."""
+
+    def end(v):
+        push = lambda v, _: (v - scale(norm(v), v) + 0.1 * unit(v) + square_root(dot(v, v)), None)  # noqa: E731
+        return jax.lax.scan(push, v, None, length=3)[0][0]
+
+    forward, reverse = jax.jacfwd, jax.jacrev
+    nestings = [(forward, forward), (forward, reverse), (reverse, reverse), (reverse, forward)]
+    for second in jax.jit(lambda v: [outer(inner(end))(v) for outer, inner in nestings])(jnp.zeros(2)):
+        np.testing.assert_array_equal(second, np.zeros((2, 2)))
 
 
 @pytest.mark.parametrize("shape", [(), (2,), (4, 1)])

@@ -3,7 +3,6 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
@@ -13,7 +12,7 @@ from physjax.checks import declared, positive_integer, real_quantity
 from physjax.physics.networks import Network
 from physjax.physics.tangents import SpringsTangent, product, tangent_numbers
 from physjax.scene import Force, Particles
-from physjax.vectors import dot, norm, unit
+from physjax.vectors import dot, norm, square_root, unit
 
 
 class Springs(Force):
@@ -113,7 +112,7 @@ class Springs(Force):
             k, L = self._at(slot, self.k, d), self._at(slot, self.L, d)
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
-            pull = k * (apart - L * _root(square))
+            pull = k * (apart - L * square_root(square))
             if damped:
                 pull = pull + self._at(slot, self.c, d) * product(d, parts[1][slot])
             # kept apart, or it would be computed anew for every component and both ends; a division at the end is what
@@ -131,7 +130,7 @@ class Springs(Force):
             apart = jnp.where(square > 0, square, 1.0)
             holding = self._at(slot, self._holding, d)
             k = jnp.where(holding, self._at(slot, self.k, d), 0.0)
-            g, h = tangent_numbers(k, self._at(slot, self.L, d) * _root(square) / apart, apart)
+            g, h = tangent_numbers(k, self._at(slot, self.L, d) * square_root(square) / apart, apart)
             gamma = None if self.c is None else jnp.where(holding, self._at(slot, self.c, d), 0.0) / apart
             springs.append((edge, d, g, h, gamma))
         return SpringsTangent(self.network, state, self(t, state, mass), springs)
@@ -141,7 +140,7 @@ class Springs(Force):
         self._demand_nodes(state)
         energies = []
         for slot, d in enumerate(self.network.parts(state.position)[0]):
-            stretch = _root(product(d, d)) - self._at(slot, self.L, d)
+            stretch = square_root(product(d, d)) - self._at(slot, self.L, d)
             energy = 0.25 * self._at(slot, self.k, d) * stretch * stretch
             energies.append(jnp.where(self._at(slot, self._holding, d), energy, 0.0))
         return self.network.ways.shared(energies)
@@ -233,16 +232,3 @@ class Springs(Force):
                 f"Springs: got positions of shape {state.position.shape}, expected (*scenes, {self.nodes}, dim): the "
                 f"pairs join {self.nodes} nodes. If the scene has more, give Springs(..., nodes=)."
             )
-
-
-@jax.custom_jvp
-def _root(square: Array) -> Array:
-    """√s, whose derivative at 0 is 0: ends that meet have no line between them."""
-    return jnp.sqrt(square)
-
-
-@_root.defjvp
-def _root_jvp(primals, tangents):
-    (square,), (change,) = primals, tangents
-    root = _root(square)
-    return root, 0.5 * change * jnp.where(square > 0, 1.0 / jnp.where(square > 0, root, 1.0), 0.0)

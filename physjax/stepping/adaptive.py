@@ -76,7 +76,8 @@ class Adaptive(eqx.Module):
         else:
             end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
         ok = ~end.failed & ~end.going(dt)
-        state = jax.tree.map(lambda leaf: jnp.where(wide(ok, leaf), leaf, jnp.nan), end.state)
+        # a product and no choice: the derivatives of what is not a number are none either, where a choice would say zero
+        state = jax.tree.map(lambda leaf: leaf * wide(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state)
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
     def _attempt(self, system: Any, t: Any, dt: Any, floor: Any, ceiling: Any, walk: "_Walk") -> "_Walk":
@@ -191,9 +192,9 @@ def adaptive(
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
     (a millionth of dt, if not given) ends that lane as NaN: `.ok` and `.first_bad_step` of a run tell. `tries` bounds
-    the steps of one dt and makes the run differentiable in reverse; more of them needed is NaN as well. Symplectic
-    methods (semi-implicit Euler, verlet, leapfrog) lose their virtue: with steps that follow the state their energy
-    drifts.
+    the steps of one dt and makes the run differentiable in reverse; where more are needed, state and derivatives are NaN
+    as well. Symplectic methods (semi-implicit Euler, verlet, leapfrog) lose their virtue: with steps that follow the
+    state their energy drifts.
 
     Example:
         >>> careful = methods.adaptive(methods.rk4, atol=1e-5, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""How far the gradient of a run can be trusted: how its sensitivity to the start grows, and when errors have grown as large."""
+"""How far the gradient of a run can be trusted: how its sensitivity to the start grows, and whether `jax.grad` has it right."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,9 +12,12 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import known, real_quantity
 from physjax.scene import Scene
+from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.simulate import simulate
 from physjax.vectors import dot, norm
 
+ROUNDED = 100.0
+"""Times the share to which rounding grows along a path: so far apart may the two modes be."""
 PROBES = 32
 """Directions looked at: all there are, if they are no more; else random ones, whose mean square is right to a quarter."""
 
@@ -26,7 +29,9 @@ class GradientHealth(eqx.Module):
     deviation is `of` the velocity. It grows as e^(rate t) where it is `exponential`, else as t^power; the other number is
     then 0. `limit` is the sensitivity at which the error of the start has become the given fraction of the path, `horizon`
     [s] the time at which it does: beyond it a gradient says nothing about the true path. A horizon beyond the run goes on
-    with the law found.
+    with the law found. `mismatch` is how far `jax.grad` is from forward mode, as a share of the derivative, infinite where
+    it is not a number (None where it was not asked for): where that is more than rounding, it is not `ok`, and its horizon
+    is 0.
 
     Example:
         >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
@@ -41,6 +46,8 @@ class GradientHealth(eqx.Module):
     power: Float[Array, "*units"]
     limit: Float[Array, "*units"]
     horizon: Float[Array, "*units"]
+    mismatch: Float[Array, "*units"] | None
+    ok: Bool[Array, "*units"]
     fraction: Float[Array, ""]
     of: str = eqx.field(static=True)
 
@@ -63,6 +70,7 @@ def health(
     error: ArrayLike | None = None,
     size: ArrayLike | None = None,
     fraction: ArrayLike = 0.1,
+    reverse: bool | None = None,
 ) -> GradientHealth:
     """How the sensitivity of a run to its start grows with its length, and up to when its gradient can be trusted.
 
@@ -71,8 +79,10 @@ def health(
     ones where there are more. `error` [m] or [m/s] is how wrong the start is: rounding, if not given, ε times the largest
     position (velocity); for that of the method give what it errs in a characteristic time. The horizon is where error
     times sensitivity reaches the `fraction` of `size` [m]: of how far the path goes, as the frames tell, if not given.
-    Under vmap and jit as well. Raises ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up
-    has an infinite sensitivity from there on.
+    Reverse mode is held against it along one random mixture of the frames; with `reverse=False` it is not, nor, if not
+    given, where it cannot be: under `methods.adaptive` without `tries`, where `jax.grad` raises. Under vmap and jit as
+    well. Raises ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up has an infinite
+    sensitivity from there on.
 
     Example:
         >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
@@ -107,7 +117,35 @@ def health(
     limit = jnp.broadcast_to(fraction.astype(start.dtype) * size / error, scene.status_shape)
     time = run.time.reshape(run.time.shape + (1,) * (sensitivity.ndim - run.time.ndim))
     law = _law(time, sensitivity)
-    return GradientHealth(run.time, sensitivity, *law, limit, _horizon(time, sensitivity, limit, *law), fraction, of)
+    horizon = _horizon(time, sensitivity, limit, *law)
+    mismatch, ok = None, jnp.ones(horizon.shape, bool)
+    if reverse or (reverse is None and not (isinstance(method, Adaptive) and method.tries is None)):
+        pull = jax.vjp(lambda leaf: frames(leaf)[0], start)[1]
+        mismatch, whole = _mismatch(scene, moves, jnp.broadcast_to(ways, (len(ways), *start.shape)), pull, sensitivity)
+        # where paths from rounded starts go apart, so do the two programs
+        allowed = float(jnp.finfo(start.dtype).eps) ** 0.5 + ROUNDED * jnp.max(sensitivity, axis=0) / limit
+        ok = jnp.isfinite(mismatch) & (mismatch <= allowed)
+        horizon = jnp.where(ok | ~whole, horizon, 0.0)
+    return GradientHealth(run.time, sensitivity, *law, limit, horizon, mismatch, ok, fraction, of)
+
+
+def _mismatch(scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivity: Array) -> tuple[Array, Array]:
+    """How far reverse mode is from forward mode, as a share; and for which units forward mode is finite.
+
+    Both give the derivative of one random mixture of all frames' positions along every way that was looked at.
+    """
+    shape = sensitivity.shape + (1,) * (moves.ndim - 1 - sensitivity.ndim)
+    whole = jnp.all(jnp.isfinite(sensitivity), axis=0)
+    known = whole[None] & (sensitivity > 0)
+    weight = jnp.where(known, 1.0 / jnp.where(known, sensitivity, 1.0), 0.0).reshape(shape)
+    mixture = weight * jax.random.normal(jax.random.key(1), moves.shape[1:], moves.dtype)
+    (gradient,) = pull(mixture)
+    over_nodes = lambda number: jnp.sum(number, axis=-1) if scene.couples else number  # noqa: E731
+    forward = over_nodes(jnp.sum(dot(mixture[None], moves), axis=1))
+    backward = over_nodes(dot(jnp.broadcast_to(gradient, ways.shape), ways))
+    size = jnp.sqrt(jnp.mean(forward**2, axis=0))
+    apart = jnp.sqrt(jnp.mean((backward - forward) ** 2, axis=0)) / jnp.where(size > 0, size, 1.0)
+    return jnp.where(jnp.isfinite(apart), apart, jnp.inf), whole
 
 
 def _ways(scene: Scene) -> Array:

@@ -17,14 +17,13 @@ formula.
 import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, demand, real_array, real_quantity
-from physjax.vectors import norm
+from physjax.vectors import norm, square_root
 
 __all__ = [
     "Aim",
@@ -299,20 +298,7 @@ def _root(square: Array, scale: ArrayLike) -> tuple[Array, Array]:
     """Its square root and whether it is real: negative only by rounding, measured against `scale`, is zero; else 1 stands in."""
     slack = ROUNDING * float(jnp.finfo(square.dtype).eps) * scale
     real = square >= -slack
-    return _sqrt(jnp.where(real, jnp.maximum(square, 0.0), 1.0)), real
-
-
-@jax.custom_jvp
-def _sqrt(x):
-    """√x, whose derivative at zero is zero instead of infinite."""
-    return jnp.sqrt(x)
-
-
-@_sqrt.defjvp
-def _sqrt_jvp(primals, tangents):
-    (x,), (dx,) = primals, tangents
-    root = _sqrt(x)
-    return root, 0.5 * dx * jnp.where(x > 0, 1.0 / jnp.where(x > 0, root, 1.0), 0.0)
+    return square_root(jnp.where(real, jnp.maximum(square, 0.0), 1.0)), real
 
 
 def _or_nan(ok: Array, value: Array) -> Array:

@@ -145,6 +145,23 @@ def test_a_bounded_number_of_tries_can_be_differentiated():
     assert not bool(simulate(SCENES["kepler"]().scene, few, dt=1.0, steps=1).ok)
 
 
+def test_too_few_tries_leave_no_derivatives_and_harm_no_other_lane():
+    few = methods.adaptive(methods.euler, 1e-6, 1e-6, tries=2)
+
+    def ends(stiffness):
+        spring = forces.Anchor(point=jnp.zeros(1), stiffness=stiffness)
+        scene = Scene(Particles(jnp.ones((2, 1)), jnp.zeros((2, 1))), forces=(spring,))
+        return simulate(scene, few, dt=0.5, steps=1).position[-1, :, 0]
+
+    @jax.jit
+    def told(stiffness):
+        forward = jax.jvp(ends, (stiffness,), (jnp.ones(2),))
+        return *forward, jax.grad(lambda k: jnp.sum(ends(k)))(stiffness)
+
+    for found in told(jnp.asarray([1e-9, 50.0])):  # the slow spring is through in two tries
+        np.testing.assert_array_equal(np.isfinite(found), [True, False])
+
+
 def test_it_works_in_both_precisions(precision):
     scene = Scene(Particles(jnp.ones(1, precision.dtype), jnp.zeros(1, precision.dtype)), forces=(
         forces.Anchor(point=jnp.zeros(1, precision.dtype), stiffness=1.0),

@@ -106,6 +106,28 @@ def test_beyond_the_horizon_paths_from_rounded_starts_have_nothing_in_common():
     assert apart.max() > 0.1 * size
 
 
+def test_what_reverse_mode_makes_not_a_number_is_not_healthy():
+    """A choice between a root and zero: at zero forward mode leaves the root out, and reverse mode multiplies it by zero."""
+
+    def trap(t, state, mass):
+        x = state.position
+        return jnp.where(x > 0, jnp.sqrt(jnp.abs(x)), 0.0) - 0.5 * state.velocity
+
+    # of two lanes that move down the first starts at zero
+    start = Particles(jnp.asarray([[0.0], [-1.0]]), -jnp.ones((2, 1)))
+    scene = Scene(start, forces=(forces.independent(trap),))
+    found, unasked = (
+        gradients.health(scene, methods.semi_implicit_euler, dt=0.1, steps=20, reverse=asked) for asked in (None, False)
+    )
+    np.testing.assert_array_equal(found.ok, [False, True])
+    assert np.isinf(found.mismatch[0])
+    assert found.mismatch[1] < 1e-12
+    assert found.horizon[0] == 0.0
+    assert found.horizon[1] == unasked.horizon[1] > 2.0
+    assert unasked.mismatch is None
+    assert unasked.horizon[0] > 2.0
+
+
 def test_many_directions_are_sampled():
     x = jax.random.normal(jax.random.key(1), (20, 2))
     cloud = Scene(Particles(x, 0.1 * x), 0.05, (forces.Gravitation(G=1.0, softening=0.5),))
