@@ -66,9 +66,11 @@ class _Leg(NamedTuple):
 def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """The response of rigid bodies: from impact to impact, at most 8 a body and step, and held in between.
 
-    A body that would have more impacts in a step waits where it is, with its velocity, for the next. An impact after
-    which a point would fly for less than a quarter of a step is the last, where K_r < 1. Coupled bodies share their
-    step, which cannot be cut for one of them: they are held alike, but impacts are answered at its end.
+    A body that would have more impacts in a step waits where it is, with its velocity, for the next; where a moving
+    surface comes over it as it waits, it becomes NaN, which its status tells. An impact after which a point would fly
+    for less than a quarter of a step is the last, where K_r < 1. Coupled bodies share their step, which cannot be cut
+    for one of them: they are held alike, but impacts are answered at its end, and a body that has passed through a ball
+    by then becomes NaN.
     """
     leg, dt = _beginning(scene, dt)
     if scene.couples:
@@ -151,7 +153,7 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> 
     hit = going & jnp.any(dip.last <= 1, axis=0)
 
     def touch():
-        duration = jnp.maximum(_moment(motion, here, (dip, hit), thrust, begun, rest), hair(dt))
+        duration = jnp.maximum(_moment(motion, here, (dip, hit, on), thrust, begun, rest), hair(dt))
         at = apart(hit, lambda: _carried(motion, here, thrust, begun, duration), leg.state)
         struck = _struck(here, at, hit, kick, begun + duration, dt)
         return chosen(hit, _Leg(leg.elapsed + duration, struck, leg.arrived), through)
@@ -179,7 +181,18 @@ def _answered_at_the_end(motion: Callable, scene: Scene, t: ArrayLike, dt: Array
     struck = _struck(scene, end, jnp.ones(dt.shape, bool), kick, t + dt, dt)
     for contact in _touches(scene):
         struck = contact.respond(t + dt, struck)
-    return struck
+    if not any(contact.narrow for contact in _touches(scene)):
+        return struck
+    return without(_passed_through(scene, on, end, t, dt), struck)
+
+
+def _passed_through(scene: Scene, on: Array, end: RigidBodies, t: ArrayLike, dt: Array) -> Array:
+    """Which bodies have a point that went deep through an obstacle and out again within a step, unseen at its end."""
+    start, end = lax.stop_gradient((felt_by(scene, t, scene.state), felt_by(scene, t + dt, end)))
+    dip = _dips(scene, on, start, end, t, dt)
+    # a step fine enough for an answer at its end only grazes what it does not see
+    deep = dip.below < -0.1 * norm(end.center.position - start.center.position)
+    return jnp.any((dip.last < 1) & (start.gap >= 0) & (end.gap >= 0) & deep, axis=0)
 
 
 def _touches(scene: Scene) -> list:
@@ -309,13 +322,16 @@ def _dips(scene: Scene, on: Array, start: Felt, end: Felt, t: ArrayLike, dt: Arr
 
 
 def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun: Array, rest: Array) -> Array:
-    """When the first point reaches its surface on the method's own path [s after `begun`]; differentiable."""
-    (dip, hit), rest = lax.stop_gradient((watched, rest))
+    """When the first point reaches its surface on the method's own path [s after `begun`]; differentiable.
+
+    Every point is looked at that nothing holds: one that turns fast may go in where its cubic has not foreseen it.
+    """
+    (dip, hit, on), rest = lax.stop_gradient((watched, rest))
     falls = dip.last <= 1
 
-    def lowest(duration, scene, thrust, falls, begun):
+    def lowest(duration, scene, thrust, on, begun):
         state = _carried(motion, scene, thrust, begun, duration)
-        return jnp.min(jnp.where(falls, felt_by(scene, begun + duration, state).gap, jnp.inf), axis=0)
+        return jnp.min(jnp.where(on, jnp.inf, felt_by(scene, begun + duration, state).gap), axis=0)
 
     last = jnp.min(dip.last, axis=0)
     first = jnp.min(jnp.where(falls, dip.first, jnp.inf), axis=0)
@@ -324,7 +340,7 @@ def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun
     bracket = (jnp.where(hit, first, 0.0) * rest, jnp.minimum(last, 1.0) * rest)
     tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest
     above, below = jnp.where(hit, above, 1.0), jnp.where(hit, below, -1.0)
-    return first_root(lowest, (scene, thrust, falls, begun), (bracket, (above, below), hit, tolerance))
+    return first_root(lowest, (scene, thrust, on, begun), (bracket, (above, below), hit, tolerance))
 
 
 def _struck(scene: Scene, state: RigidBodies, hit: Array, kick: Array, t: ArrayLike, dt: Array) -> RigidBodies:

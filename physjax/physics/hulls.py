@@ -23,7 +23,7 @@ from physjax.checks import demand_legal, real_quantity
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_velocity, in_world
 from physjax.physics.collide import Felt, collide
-from physjax.physics.contacts import Surface
+from physjax.physics.contacts import Sphere, Surface
 from physjax.physics.impulses import Points
 from physjax.physics.inertia import Inertia
 from physjax.scene import Contact
@@ -88,6 +88,8 @@ class Touch(Contact):
     with Coulomb's friction at μ_k; no impact can add energy. Points that stay are held, roll or slide there, second
     order in dt. A body that is slower than a millionth of what a step's load gives, and whose reactions balance that
     load, keeps its place to the last bit. Where forces couple the bodies, impacts are answered at the end of the step.
+    Points are followed through the step: no plate is too thin for them, no ball too small, as long as the method follows
+    how the body turns.
 
     Only points touch: the edge of a box passes through a ball that is a surface, and through a kerb. Bodies do not
     hang on a pivot.
@@ -162,6 +164,11 @@ class Touch(Contact):
     def relative(self, velocity: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
         """Velocities as seen from the surface [m/s]."""
         return self.surface.relative(velocity)
+
+    @property
+    def narrow(self) -> bool:
+        """Whether a fast point may pass through the surface and out again within a step: a ball, not a wall or a plate."""
+        return isinstance(self.surface, Sphere) and not self.surface.inside
 
     def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
         """Where in a leg a point comes lowest, as a share of it, and its gap there, as the surface finds it."""
