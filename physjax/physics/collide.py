@@ -17,7 +17,17 @@ from jaxtyping import Array
 from physjax.lanes import any_lane, apart
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_acceleration, angular_velocity
-from physjax.physics.impact import IMPACTS, SHORTEST_FLIGHT, Dip, Flight, chosen, dip_of, hair
+from physjax.physics.impact import (
+    IMPACTS,
+    SHORTEST_FLIGHT,
+    Dip,
+    Flight,
+    chosen,
+    dip_of,
+    hair,
+    passed_over,
+    without,
+)
 from physjax.physics.impulses import Points, impulses
 from physjax.roots import first_root
 from physjax.scene import Scene, traced_once
@@ -32,12 +42,16 @@ AT_REST = 1e-6
 
 
 class Felt(NamedTuple):
-    """The points of hulls as their surfaces feel them, the points first: `center` is where the gap is measured from."""
+    """The points of hulls as their surfaces feel them, the points first: `center` is where the gap is measured from.
+
+    `turning` is how fast the normal turns there [1/s], and the radius [m] of what touches; None where all is flat.
+    """
 
     points: Points
     center: Particles
     gap: Array
     restitution: Array
+    turning: tuple[Array, Array] | None
 
 
 class _Leg(NamedTuple):
@@ -52,9 +66,11 @@ class _Leg(NamedTuple):
 def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """The response of rigid bodies: from impact to impact, at most 8 a body and step, and held in between.
 
-    A body that would have more impacts in a step waits where it is, with its velocity, for the next. An impact after
-    which a point would fly for less than a quarter of a step is the last, where K_r < 1. Coupled bodies share their
-    step, which cannot be cut for one of them: they are held alike, but impacts are answered at its end.
+    A body that would have more impacts in a step waits where it is, with its velocity, for the next; where a moving
+    surface comes over it as it waits, it becomes NaN, which its status tells. An impact after which a point would fly
+    for less than a quarter of a step is the last, where K_r < 1. Coupled bodies share their step, which cannot be cut
+    for one of them: they are held alike, but impacts are answered at its end, and a body that has passed through a ball
+    by then becomes NaN.
     """
     leg, dt = _beginning(scene, dt)
     if scene.couples:
@@ -68,7 +84,7 @@ def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scen
         return lax.cond(any_lane(~leg.arrived), further, lambda leg: leg, leg), None
 
     leg, _ = lax.scan(go_on, leg, length=IMPACTS + 1)
-    return scene.having(state=leg.state)
+    return scene.having(state=_waited(scene, leg, t, dt))
 
 
 def collisions(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Callable, total: Any) -> Any:
@@ -85,14 +101,15 @@ def collisions(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add:
         return Flight(here.state, start, _own(scene, begun), _own(scene, duration), end, after, flying)
 
     if scene.couples:
-        thrust = _thrust(scene, _on_now(scene, t, dt), t, dt)
+        thrust = _thrust(_facing(scene, t), _on_now(_facing(scene, t), t, dt), t, dt)
         after = _answered_at_the_end(motion, scene, t, dt)
         return add(total, flown(scene, thrust, jnp.broadcast_to(t, dt.shape), dt, after, None)), after
 
     def fly(leg, total):
         begun, rest = _left(leg, t, dt)
         here = scene.having(state=leg.state)
-        thrust = _thrust(here, _on_now(here, begun, dt) & ~leg.arrived[None], begun, rest)
+        seen = _facing(here, begun)
+        thrust = _thrust(seen, _on_now(seen, begun, dt) & ~leg.arrived[None], begun, rest)
         after = chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
         duration = jnp.maximum(after.elapsed - leg.elapsed, hair(dt))
         return after, add(total, flown(here, thrust, begun, duration, after.state, ~leg.arrived))
@@ -101,7 +118,7 @@ def collisions(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add:
         return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
 
     (leg, total), _ = lax.scan(go_on, (leg, total), length=IMPACTS + 1)
-    return total, leg.state
+    return total, _waited(scene, leg, t, dt)
 
 
 def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
@@ -124,7 +141,7 @@ def _own(scene: Scene, number: Array) -> Array:
 def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> _Leg:
     """From where the bodies are to the first impact of each, or to the end of the step."""
     (begun, rest), going = _left(leg, t, dt), ~leg.arrived
-    here = scene.having(state=leg.state)
+    here = _facing(scene.having(state=leg.state), begun)
     kick = _kick(here, begun, dt)
     felt = lax.stop_gradient(felt_by(here, begun, leg.state))
     on = _on(felt, leg.state, kick, dt) & going[None]
@@ -132,31 +149,64 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> 
     end = apart(going, lambda: _carried(motion, here, thrust, begun, rest), leg.state)
     held = apart(on, lambda: _landed(here, end, on, kick, begun + rest), end)
     through = _Leg(leg.elapsed + rest, held, jnp.ones_like(leg.arrived))
-    dip = lax.stop_gradient(_dips(scene, on, felt, felt_by(here, begun + rest, held), begun, rest))
+    dip = lax.stop_gradient(_dips(here, on, felt, felt_by(here, begun + rest, held), begun, rest))
     hit = going & jnp.any(dip.last <= 1, axis=0)
 
     def touch():
-        duration = jnp.maximum(_moment(motion, here, (dip, hit), thrust, begun, rest), hair(dt))
+        duration = jnp.maximum(_moment(motion, here, (dip, hit, on), thrust, begun, rest), hair(dt))
         at = apart(hit, lambda: _carried(motion, here, thrust, begun, duration), leg.state)
-        struck = _struck(scene, at, hit, kick, begun + duration, dt)
+        struck = _struck(here, at, hit, kick, begun + duration, dt)
         return chosen(hit, _Leg(leg.elapsed + duration, struck, leg.arrived), through)
 
     return lax.cond(any_lane(hit), touch, lambda: through)
 
 
+def _waited(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> RigidBodies:
+    """The bodies after a step; those that waited in it where a surface has moved over them are not finite any more."""
+
+    def lost():
+        begun = t + leg.elapsed
+        seen = _facing(scene.having(state=leg.state), begun)
+        return ~leg.arrived & passed_over(_touches(seen), begun, t + dt, leg.state)
+
+    return without(apart(~leg.arrived, lost), leg.state)
+
+
 def _answered_at_the_end(motion: Callable, scene: Scene, t: ArrayLike, dt: Array) -> RigidBodies:
     """The whole step held by what touches from its start; impacts answered at its end, and what went in moved out."""
+    scene = _facing(scene, t)
     kick, on = _kick(scene, t, dt), _on_now(scene, t, dt)
     end = _carried(motion, scene, _thrust(scene, on, t, dt), t, dt)
     end = apart(on, lambda: _landed(scene, end, on, kick, t + dt), end)
     struck = _struck(scene, end, jnp.ones(dt.shape, bool), kick, t + dt, dt)
     for contact in _touches(scene):
         struck = contact.respond(t + dt, struck)
-    return struck
+    if not any(contact.narrow for contact in _touches(scene)):
+        return struck
+    return without(_passed_through(scene, on, end, t, dt), struck)
+
+
+def _passed_through(scene: Scene, on: Array, end: RigidBodies, t: ArrayLike, dt: Array) -> Array:
+    """Which bodies have a point that went deep through an obstacle and out again within a step, unseen at its end."""
+    start, end = lax.stop_gradient((felt_by(scene, t, scene.state), felt_by(scene, t + dt, end)))
+    dip = _dips(scene, on, start, end, t, dt)
+    # a step fine enough for an answer at its end only grazes what it does not see
+    deep = dip.below < -0.1 * norm(end.center.position - start.center.position)
+    return jnp.any((dip.last < 1) & (start.gap >= 0) & (end.gap >= 0) & deep, axis=0)
 
 
 def _touches(scene: Scene) -> list:
     return [contact for contact in scene.contacts if contact.response is collide]
+
+
+def _facing(scene: Scene, t: ArrayLike) -> Scene:
+    """The scene with surfaces as its bodies see them from where they are: rooms taken apart, of a slab the nearer face."""
+    seen = [
+        wall.facing(t, scene.state) if contact.response is collide else wall
+        for contact in scene.contacts
+        for wall in (contact.walls() if contact.response is collide else (contact,))
+    ]
+    return scene.having(contacts=tuple(seen))
 
 
 def _kick(scene: Scene, t: ArrayLike, dt: Array) -> Array:
@@ -168,6 +218,9 @@ def _kick(scene: Scene, t: ArrayLike, dt: Array) -> Array:
 def felt_by(scene: Scene, t: ArrayLike, state: RigidBodies) -> Felt:
     """Every point of every hull, as its surface feels it."""
     parts = [contact.felt(t, state, scene.mass) for contact in _touches(scene)]
+    if len(parts) > 1 and any(part.turning is not None for part in parts):
+        flat = lambda part: (jnp.zeros_like(part.points.normal), jnp.zeros_like(part.gap))  # noqa: E731
+        parts = [part._replace(turning=part.turning or flat(part)) for part in parts]
     if len(parts) > 1 and any(part.points.friction is not None for part in parts):
         zero = lambda part: (jnp.zeros_like(part.gap), jnp.zeros_like(part.gap))  # noqa: E731
         rough = [part.points._replace(friction=part.points.friction or zero(part)) for part in parts]
@@ -235,8 +288,14 @@ def _pressed(scene: Scene, state: RigidBodies, on: Array, t: ArrayLike, ahead: A
     omega, change = angular_velocity(state, mass), angular_acceleration(state, mass, torque)
     spread = lambda vector: jnp.broadcast_to(vector, points.arm.shape)  # noqa: E731
     # a ball touches ever other points of itself: what moves on a circle is the point in its middle
-    bent = cross(spread(omega), cross(spread(omega), felt.center.position - spread(state.position)))
-    faster = spread(scale(1 / mass.mass, force)) + cross(spread(change), points.arm) + bent
+    moves = cross(spread(omega), felt.center.position - spread(state.position))
+    if felt.turning is not None:
+        # and over curved ground the point that touches moves around it as the normal turns
+        turning, radius = felt.turning
+        moves = moves - scale(radius, turning)
+    faster = spread(scale(1 / mass.mass, force)) + cross(spread(change), points.arm) + cross(spread(omega), moves)
+    if felt.turning is not None:
+        faster = faster + scale(dot(turning, points.velocity), points.normal)
     velocity = points.velocity + scale(jnp.broadcast_to(ahead, on.shape), faster)
     return impulses(points._replace(velocity=velocity), on, state, mass)
 
@@ -263,13 +322,16 @@ def _dips(scene: Scene, on: Array, start: Felt, end: Felt, t: ArrayLike, dt: Arr
 
 
 def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun: Array, rest: Array) -> Array:
-    """When the first point reaches its surface on the method's own path [s after `begun`]; differentiable."""
-    (dip, hit), rest = lax.stop_gradient((watched, rest))
+    """When the first point reaches its surface on the method's own path [s after `begun`]; differentiable.
+
+    Every point is looked at that nothing holds: one that turns fast may go in where its cubic has not foreseen it.
+    """
+    (dip, hit, on), rest = lax.stop_gradient((watched, rest))
     falls = dip.last <= 1
 
-    def lowest(duration, scene, thrust, falls, begun):
+    def lowest(duration, scene, thrust, on, begun):
         state = _carried(motion, scene, thrust, begun, duration)
-        return jnp.min(jnp.where(falls, felt_by(scene, begun + duration, state).gap, jnp.inf), axis=0)
+        return jnp.min(jnp.where(on, jnp.inf, felt_by(scene, begun + duration, state).gap), axis=0)
 
     last = jnp.min(dip.last, axis=0)
     first = jnp.min(jnp.where(falls, dip.first, jnp.inf), axis=0)
@@ -278,7 +340,7 @@ def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun
     bracket = (jnp.where(hit, first, 0.0) * rest, jnp.minimum(last, 1.0) * rest)
     tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest
     above, below = jnp.where(hit, above, 1.0), jnp.where(hit, below, -1.0)
-    return first_root(lowest, (scene, thrust, falls, begun), (bracket, (above, below), hit, tolerance))
+    return first_root(lowest, (scene, thrust, on, begun), (bracket, (above, below), hit, tolerance))
 
 
 def _struck(scene: Scene, state: RigidBodies, hit: Array, kick: Array, t: ArrayLike, dt: Array) -> RigidBodies:

@@ -7,6 +7,7 @@ Shapes may move with a constant `velocity` [m/s] from where they are at t = 0 (a
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -36,6 +37,7 @@ class Surface(Contact):
         [3. 2.]
     """
 
+    curved: ClassVar[bool] = True
     restitution: Float[Array, "..."] = quantity(
         "restitution K_r", "1", at_least=0, at_most=1, default=1.0, kw_only=True
     )
@@ -66,9 +68,9 @@ class Surface(Contact):
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Signed distance to the surface [m], > 0 on the legal side."""
 
-    @abstractmethod
     def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-        """Unit vector towards the legal side."""
+        """Unit vector towards the legal side: unless a shape says it, the direction in which its gap grows."""
+        return unit(jax.grad(lambda x: jnp.sum(self.gap(t, x)))(position))
 
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after a touch: back on the surface, v' = (1 - K_f) v_t - K_r v_n for a lane that was going in.
@@ -89,7 +91,13 @@ class Surface(Contact):
 
     def bend(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """What the surface's curvature adds to the second time derivative of the gap [m/s²]: nothing where it is flat."""
-        return jnp.zeros_like(relative[..., 0])
+        if not self.curved:
+            return jnp.zeros_like(relative[..., 0])
+        return dot(relative, self.normal_rate(t, position, relative))
+
+    def normal_rate(self, t: ArrayLike, position: Array, relative: Array) -> Array:
+        """How fast the normal turns under a lane that moves over the surface [1/s], from `outward` by differentiation."""
+        return jax.jvp(lambda x: self.outward(t, x), (position,), (relative,))[1]
 
     def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
         """Where in a step the path comes lowest, as a share of it, and its gap there; `dip` is what the gap's cubic says."""
@@ -167,6 +175,7 @@ class Plane(Surface):
         4.0
     """
 
+    curved: ClassVar[bool] = False
     point: Float[Array, "..."] = quantity("point of the plane", "m", kind="place")
     normal: Float[Array, "..."] = quantity("normal of the plane", "1", kind="vector")
 
@@ -196,6 +205,7 @@ class Slab(Surface):
         9.0
     """
 
+    curved: ClassVar[bool] = False
     point: Float[Array, "..."] = quantity("point in the middle of the slab", "m", kind="place")
     normal: Float[Array, "..."] = quantity("normal of the slab", "1", kind="vector")
     thickness: Float[Array, "..."] = quantity("thickness", "m", above=0)
@@ -259,9 +269,10 @@ class Sphere(Surface):
         return -direction if self.inside else direction
 
     def bend(self, t: ArrayLike, position: Array, relative: Array) -> Array:
-        """|v_t|²/r: along the surface a path bends away from the ball, or into the bowl."""
-        normal_speed = dot(relative, self.outward(t, position))
-        across = (dot(relative, relative) - normal_speed**2) / self.radius
+        """|v_t|²/r, r from the center: along the surface a path bends away from the ball, or into the bowl."""
+        offset = self._offset(t, position)
+        distance, across = norm(offset), dot(relative, relative) - dot(relative, unit(offset)) ** 2
+        across = across / jnp.where(distance > 0, distance, 1.0)
         return -across if self.inside else across
 
     def may_dip(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
@@ -316,6 +327,7 @@ class Room(Surface):
         2.0
     """
 
+    curved: ClassVar[bool] = False
     lower: Float[Array, "..."] = quantity("lower corner", "m", kind="place")
     upper: Float[Array, "..."] = quantity("upper corner", "m", kind="place")
 

@@ -9,6 +9,7 @@ two ends of its axis. Bodies pass through each other: there are no stacks, and n
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -22,7 +23,7 @@ from physjax.checks import declared, demand_legal, real_quantity
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_velocity, in_world
 from physjax.physics.collide import Felt, collide
-from physjax.physics.contacts import Surface
+from physjax.physics.contacts import Sphere, Surface
 from physjax.physics.impulses import Points
 from physjax.physics.inertia import Inertia
 from physjax.scene import Contact
@@ -87,6 +88,8 @@ class Touch(Contact):
     with Coulomb's friction at μ_k; no impact can add energy. Points that stay are held, roll or slide there, second
     order in dt. A body that is slower than a millionth of what a step's load gives, and whose reactions balance that
     load, keeps its place to the last bit. Where forces couple the bodies, impacts are answered at the end of the step.
+    Points are followed through the step: no plate is too thin for them, no ball too small, as long as the method follows
+    how the body turns.
 
     Only points touch: the edge of a box passes through a ball that is a surface, and through a kerb. Bodies do not
     hang on a pivot.
@@ -134,7 +137,21 @@ class Touch(Contact):
         dry = self.surface.coulomb
         friction = None if dry is None else (wide(dry.static), wide(dry.kinetic))
         points = Points(low, normal, self.surface.relative(straight + cross(omega, low)), friction)
-        return Felt(points, center, self.gap(time, where), wide(self.surface.restitution))
+        turning = None
+        if self.surface.curved:
+            along = self.surface.relative(center.velocity)
+            turning = self.surface.normal_rate(time, where, along), self._radius(arm)
+        return Felt(points, center, self.gap(time, where), wide(self.surface.restitution), turning)
+
+    def walls(self) -> tuple["Touch", ...]:
+        """A touch of the hull with each of the surfaces that its surface is made of."""
+        walls = self.surface.walls()
+        return (self,) if len(walls) == 1 else tuple(replace(self, surface=wall) for wall in walls)
+
+    def facing(self, t: ArrayLike, state: RigidBodies) -> "Touch":
+        """The touch with the surface as a body in its place sees it: a plate has the face that its centre of mass is before."""
+        face = self.surface.facing(t, state.position)
+        return self if face is self.surface else replace(self, surface=face)
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
         """Signed distance of the ball around a point at this place to the surface [m]."""
@@ -148,14 +165,21 @@ class Touch(Contact):
         """Velocities as seen from the surface [m/s]."""
         return self.surface.relative(velocity)
 
+    @property
+    def narrow(self) -> bool:
+        """Whether a fast point may pass through the surface and out again within a step: a ball, not a wall or a plate."""
+        return isinstance(self.surface, Sphere) and not self.surface.inside
+
     def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
-        """Where in a leg a point comes lowest, as a share of it, and its gap there: what the gap's cubic says."""
-        return dip
+        """Where in a leg a point comes lowest, as a share of it, and its gap there, as the surface finds it."""
+        radius = self._radius(start.position)
+        share, depth = self.surface.deepest(t, dt, start, end, (dip[0], dip[1] + radius))
+        return share, depth - radius
 
     def clearance(self, t: ArrayLike, state: RigidBodies) -> Float[Array, "*lanes"]:
         """Signed distance of each body's lowest point to the surface [m]."""
-        where = state.position[None] + self.hull.arms(state)
-        return jnp.min(self.gap(jnp.broadcast_to(t, where.shape[:-1]), where), axis=0)
+        where, face = state.position[None] + self.hull.arms(state), self.facing(t, state)
+        return jnp.min(face.gap(jnp.broadcast_to(t, where.shape[:-1]), where), axis=0)
 
     def respond(self, t: ArrayLike, state: RigidBodies) -> RigidBodies:
         """The bodies that are on the wrong side moved out of it, their velocities as they were."""

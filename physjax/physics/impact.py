@@ -34,7 +34,8 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
     """The response that finds when each lane touches within the step, bounces it there, and goes on from there.
 
     For independent lanes. At most 8 touches a lane and step: a lane that would touch yet more often waits where it is,
-    energy and all, for the next step, so nothing ever passes. When a flight to the next bounce would be shorter than a
+    energy and all, for the next step, so nothing ever passes; where a moving surface comes over it as it waits, it
+    becomes NaN, which its status tells. When a flight to the next bounce would be shorter than a
     quarter of a step, the lane comes to rest: the bounces that remain take 2v/(g(1 - K_r)) more, which
     `touching_since` records. From then on it is held by the surface, lies still or slides, until a force lifts it off.
 
@@ -106,7 +107,33 @@ def _through_touches(
         return lax.cond(more, lambda: chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt)), lambda: leg), None
 
     leg, _ = lax.scan(go_on, leg, length=IMPACTS + 1)
-    return leg.state, leg.since
+    return _waited(scene, leg, t, dt), leg.since
+
+
+def _waited(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> Particles:
+    """The lanes after a step; those that waited in it where a surface has moved over them are not finite any more."""
+
+    def lost():
+        begun = t + leg.elapsed
+        return ~leg.arrived & passed_over(_faces(_walls(scene), begun, leg.state), begun, t + dt, leg.state)
+
+    return without(apart(~leg.arrived, lost), leg.state)
+
+
+def passed_over(surfaces: list, begun: Array, ended: Array, state: Any) -> Bool[Array, "*lanes"]:
+    """Whether a surface moves over a lane that stays where it is from one moment [s] to another."""
+    x = lax.stop_gradient(state.position)
+    rounding = 64 * float(jnp.finfo(x.dtype).eps) * jnp.sqrt(dot(x, x))
+    over = jnp.zeros(rounding.shape, bool)
+    for surface in surfaces:
+        before, after = (lax.stop_gradient(surface.clearance(t, state)) for t in (begun, ended))
+        over = over | ((after < -rounding) & (after < before - rounding))
+    return over
+
+
+def without(lost: Bool[Array, "*lanes"], state: Any) -> Any:
+    """The state with NaN in the lanes that are lost: their status tells, and they harm no other."""
+    return jax.tree.map(lambda leaf: jnp.where(lost[..., None], jnp.nan, leaf), state)
 
 
 def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
@@ -181,7 +208,7 @@ def flights(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Ca
         return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
 
     (leg, total), _ = lax.scan(go_on, (leg, total), length=IMPACTS + 1)
-    return total, leg.state
+    return total, _waited(scene, leg, t, dt)
 
 
 def hair(dt: Array) -> Array:
