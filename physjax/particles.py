@@ -96,10 +96,10 @@ class Particles(NamedTuple):
                 f"Particles: got position {x.shape} and velocity {v.shape}, expected the same shape (*lanes, dim): "
                 "component last, e.g. (2,) for one ball in the plane, (10000, 3) for ten thousand in space."
             )
-        if x.shape[-1] > 3:
+        if x.ndim == 2 and x.shape[0] in (2, 3) and x.shape[1] > 4:
             raise ValueError(
-                f"Particles: got the shape {x.shape}, which is {x.shape[-1]} components, expected (*lanes, dim) with at most "
-                "3: the component is the last axis. Transpose arrays of shape (3, n)."
+                f"Particles: got the shape {x.shape}, which is {x.shape[0]} particles of {x.shape[1]} components, expected "
+                f"(*lanes, dim), the component last. For {x.shape[1]} particles transpose both arrays: position.T, velocity.T."
             )
         if 0 in x.shape:
             raise ValueError(f"Particles: got the empty shape {x.shape}, expected at least one lane and one component.")

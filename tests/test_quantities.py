@@ -160,7 +160,9 @@ def test_an_angle_in_degrees_is_refused(angle, unannotated):
 
 
 def test_components_that_come_first_are_refused():
-    with pytest.raises(ValueError, match=r"got the shape \(3, 1000\), which is 1000 components.*Transpose"):
+    with pytest.raises(
+        ValueError, match=r"got the shape \(3, 1000\), which is 3 particles of 1000 components.*transpose"
+    ):
         Scene(Particles(jnp.zeros((3, 1000)), jnp.zeros((3, 1000))))
 
 
