@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, contacts, forces, inertia, methods, rigid, simulate
+from physjax import Particles, Scene, contacts, forces, inertia, methods, rigid, simulate, stability
 
 G = 9.8
 R, r = 1.0, 0.1
@@ -222,6 +222,13 @@ def test_a_closing_wall_never_passes_a_waiting_ball_unsaid():
     assert 0 < int(run.first_bad_step[0]) <= 19
     phase = np.mod(0.5 + t, 2)
     np.testing.assert_allclose(run.position[:, 1, 0], np.where(phase > 1, 2 - phase, phase), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_what_is_lost_under_a_surface_is_explained():
+    told = stability.explain(between_closing_walls(), lane=0)
+    assert told.cause == "contact"
+    assert "waited for the next" in str(told)
 
 
 @pytest.mark.xfail(strict=True, reason="'First answers in a second': more than eight touches in a step")
