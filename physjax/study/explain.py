@@ -32,9 +32,10 @@ class Explanation(NamedTuple):
     """What went wrong. Printed, it is a few sentences.
 
     `cause` is "stiffness", "damping", "resolution" (a motion too fast for dt, though bounded), "rounding" (positions so
-    large that a step is lost in their last digits), "error measure" (an adaptive method that looks at velocities alone),
-    "input" (a traced number beyond its bounds) or "nothing". `first_bad_step` (-1: the run stayed finite) and `node` say
-    where; `limit` [s] is the step that was too long, at time `t` [s]; `growth` a small deviation's growth in one step.
+    large that a step is lost in their last digits), "contact" (a surface that came over a lane waiting for its next
+    touch), "error measure" (an adaptive method that looks at velocities alone), "input" (a traced number beyond its
+    bounds) or "nothing". `first_bad_step` (-1: the run stayed finite) and `node` say where; `limit` [s] is the step that
+    was too long, at time `t` [s]; `growth` a small deviation's growth in one step.
 
     Example:
         >>> told = stability.explain(swing, methods.verlet, dt=1.25)
@@ -62,6 +63,7 @@ class Explanation(NamedTuple):
         where = "" if self.spring is None else f" (the spring between nodes {self.spring[0]} and {self.spring[1]})"
         why = {
             "rounding": "Positions are so large that a step is lost in their rounding.",
+            "contact": "A surface came over a lane that had used up the eight touches of a step and waited for the next.",
             "error measure": "The error looks at velocities alone and cannot see that positions are wrong.",
             "input": "It starts non-finite: a traced number beyond its bounds, or a start on the wrong side of a contact.",
             "nothing": "Nothing was found wrong with the step.",
@@ -116,6 +118,8 @@ def explain(
     plain = Explanation("nothing", "", None, 0j, 0.0, step, float("inf"), 1.0, first, node, ())
     if isinstance(method, Adaptive):
         return _blind(run, method, plain)
+    if _lost_in_contact(run, first):
+        return plain._replace(cause="contact", cures=("a shorter dt, of no more than eight touches a step",))
     if _rounds(scene, step):
         return plain._replace(cause="rounding", cures=("compute in float64", "put the origin near the scene"))
     moments = list(_moments(run, scene))
@@ -181,6 +185,18 @@ def _where(run: Trajectory) -> tuple[int, tuple[int, ...]]:
         before = Particles(*(leaf[-1] for leaf in flight.recorded))
     speed = np.abs(np.asarray(before.velocity, float)).max(axis=-1)
     return first, tuple(int(i) for i in np.unravel_index(np.argmax(speed), speed.shape))
+
+
+def _lost_in_contact(run: Trajectory, first: int) -> bool:
+    """Whether the step that was the first bad one is finite if nothing is in the way."""
+    if first < 0 or not run.scene.contacts:
+        return False
+    before, scene = first - int(run.first_step) - 1, run.scene
+    if before:
+        flight = simulate(scene, run.method, dt=run.dt, steps=before, save_every=before, first_step=int(run.first_step))
+        scene = flight.final_scene
+    after = scene.having(contacts=()).step(run.method, (first - 1) * run.dt, run.dt)
+    return bool(jnp.all(scene.finite(after.state)))
 
 
 def _state(t: Any, state: Particles) -> Particles:
