@@ -141,7 +141,7 @@ def _mismatch(scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivi
     mixture = weight * jax.random.normal(jax.random.key(1), moves.shape[1:], moves.dtype)
     (gradient,) = pull(mixture)
     over_nodes = lambda number: jnp.sum(number, axis=-1) if scene.couples else number  # noqa: E731
-    forward = over_nodes(jnp.sum(dot(mixture[None], moves), axis=1))
+    forward = over_nodes(jnp.sum(dot(jnp.broadcast_to(mixture, moves.shape), moves), axis=1))
     backward = over_nodes(dot(jnp.broadcast_to(gradient, ways.shape), ways))
     size = jnp.sqrt(jnp.mean(forward**2, axis=0))
     apart = jnp.sqrt(jnp.mean((backward - forward) ** 2, axis=0)) / jnp.where(size > 0, size, 1.0)
