@@ -178,10 +178,11 @@ class Trajectory(eqx.Module):
     def load(cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Any = None) -> "Trajectory":
         """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
 
-        Without them frames and status are there all the same. What was recorded comes back as an array, or, if it was
-        more than one, as a dict by path. A run in float32 takes the given scene's numbers in float32, also where 64-bit
-        types are on, and so goes on as it would have. Raises FileNotFoundError, or ValueError for a file that is not a
-        saved run, has an array that no run could have written, or belongs to another scene, method or precision.
+        Without them frames and status are there all the same, of particles; bodies want their scene. What was recorded
+        comes back as an array, or, if it was more than one, as a dict by path. A run in float32 takes the given scene's
+        numbers in float32, also where 64-bit types are on, and so goes on as it would have. Raises FileNotFoundError, or
+        ValueError for a file that is not a saved run, has an array that no run could have written, or belongs to another
+        scene, method or precision.
 
         Example:
             >>> flight.save("flight.npz")

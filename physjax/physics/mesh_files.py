@@ -5,6 +5,7 @@ with one list of vertices; whatever else there is, normals, colours, texture coo
 """
 
 import codecs
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,7 +90,7 @@ def _obj_vertex(file: Path, number: int, words: list[str]) -> list[float]:
             f"{file.name}: line {number} has {len(words)} entries: a vertex needs 3 numbers, and may have a weight and a colour."
         )
     place = [float(word) for word in words[:3]]
-    if not np.isfinite(place).all():
+    if not all(map(math.isfinite, place)):
         raise ValueError(f"{file.name}: line {number} has the vertex {place}, expected finite numbers.")
     return place
 

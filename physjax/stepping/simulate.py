@@ -47,6 +47,9 @@ def simulate(
     ..., first_step=flight.final_step)` resumes a run. Under jit, vmap, jvp and grad as well. Raises ValueError or
     TypeError for bad numbers; a run that blows up returns with `.ok` False and `.first_bad_step`, it does not raise.
 
+    JAX keeps the compiled program of every scene that differs in more than numbers, some megabytes each; where there
+    are thousands in one process, `jax.clear_caches()` frees them.
+
     Example:
         >>> run = simulate(shot, methods.verlet, dt=0.1, duration=2.0, save_every=10)
         >>> print(run.time, run.position[:, 1])
