@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,9 +40,11 @@ class Steps(NamedTuple):
 class Adaptive(eqx.Module):
     """A method that takes each of its steps whole and in two halves, and calls the difference its error.
 
-    Made by `adaptive`; `report` also tells the steps it took.
+    Made by `adaptive`; `report` also tells the steps it took. Steps end where a force of the system jumps, and each sees
+    the mean over itself of what jumps in it: the system is asked for it, as it was before any step.
     """
 
+    subdivides: ClassVar[bool] = True
     method: Any
     atol: Float[Array, ""]
     rtol: Float[Array, ""]
@@ -70,7 +72,9 @@ class Adaptive(eqx.Module):
             state=state, elapsed=jnp.zeros(shape, kind), h=lax.stop_gradient(h), accepted=none, rejected=none, shortest=dt,
             failed=jnp.zeros(shape, bool), last=jnp.full(shape, jnp.inf, kind), error=jnp.ones(shape, kind),
         )  # fmt: skip
-        attempt = partial(self._attempt, system, t, dt, floor, ceiling)
+        attempt = partial(
+            self._attempt, system, t, dt, partial(_next_stop, _jumps(system, t, shape), dt), floor, ceiling
+        )
         if self.tries is None:
             end = lax.while_loop(lambda walk: any_lane(walk.going(dt)), attempt, start)
         else:
@@ -79,17 +83,20 @@ class Adaptive(eqx.Module):
         state = jax.tree.map(lambda leaf: jnp.where(wide(ok, leaf), leaf, jnp.nan), end.state)
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
-    def _attempt(self, system: Any, t: Any, dt: Any, floor: Any, ceiling: Any, walk: "_Walk") -> "_Walk":
+    def _attempt(
+        self, system: Any, t: Any, dt: Any, next_stop: Callable, floor: Any, ceiling: Any, walk: "_Walk"
+    ) -> "_Walk":
         """One step whole and in halves, kept if both agree, and the next length from how well they do."""
-        going, left = walk.going(dt), dt - walk.elapsed
+        stop = next_stop(walk.elapsed)
+        going, left = walk.going(dt), stop - walk.elapsed
         # two equal steps to the end rather than a long and a tiny one
         last = walk.h >= left
         h = jnp.where(last, left, jnp.where(2 * walk.h > left, left / 2, walk.h))
         h = jnp.where(going, h, 0.0)
         now = t + walk.elapsed
-        whole = self.method(system, now, walk.state, h)
-        middle = self.method(system, now, walk.state, h / 2)
-        halves = self.method(system, now + h / 2, middle, h / 2)
+        whole = self._stepped(system, now, walk.state, h)
+        middle = self._stepped(system, now, walk.state, h / 2)
+        halves = self._stepped(system, now + h / 2, middle, h / 2)
         error = lax.stop_gradient(self._error(walk.state, whole, halves, h.shape))
         good = going & (error <= 1.0)
         bad = going & ~good
@@ -98,7 +105,7 @@ class Adaptive(eqx.Module):
         longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
         return _Walk(
             state=jax.tree.map(lambda a, b: jnp.where(wide(good, a), a, b), halves, walk.state),
-            elapsed=jnp.where(good, jnp.where(last, dt, walk.elapsed + h), walk.elapsed),
+            elapsed=jnp.where(good, jnp.where(last, stop, walk.elapsed + h), walk.elapsed),
             h=jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
             accepted=walk.accepted + good.astype(jnp.int32),
             rejected=walk.rejected + bad.astype(jnp.int32),
@@ -107,6 +114,13 @@ class Adaptive(eqx.Module):
             last=jnp.where(good, h, walk.last),
             error=jnp.where(good, error, walk.error),
         )
+
+    def _stepped(self, system: Any, t: Any, state: Any, h: Any) -> Any:
+        """One step of the method, with what jumps in time replaced by its mean over the step."""
+        if hasattr(system, "during"):
+            # over no time there is no mean, and what is not a number would come back in a derivative
+            system = system.during(t, jnp.where(h > 0, h, 1.0))
+        return self.method(system, t, state, h)
 
     def _factor(self, walk: "_Walk", h: Array, error: Array, good: Array) -> Array:
         """By how much longer the next step may be: as this error allows, or less where errors have been growing.
@@ -248,11 +262,30 @@ def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
     def one(arrays, i):
         scene = eqx.combine(arrays, still)
         t = i.astype(scene.state.dtype) * dt
-        told = method.report(scene.during(t, dt), t, scene.state, dt)
+        told = method.report(scene, t, scene.state, dt)
         after = scene.step(method, t, dt)
         return eqx.filter(after, eqx.is_array), told._replace(state=after.state)
 
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
+
+    """When forces of a system jump, after t [s]: `(*shape, k)` each, or with axes of length 1 where all share them."""
+def _jumps(system: Any, t: ArrayLike, shape: tuple) -> list[Array]:
+    """When forces of a system jump, after t [s]: `(*shape, k)` each."""
+    found = []
+    for force in getattr(system, "forces", ()):
+        for times in getattr(force, "discontinuities", tuple)():
+            own = shape and times.shape[: len(shape)] == shape
+            times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
+            found.append(times - jnp.broadcast_to(t, shape)[..., None])
+    return found
+
+
+def _next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
+    """The end of dt, or the first jump before it that has not been reached."""
+    for times in jumps:
+        ahead = jnp.where(times > elapsed[..., None], times, jnp.inf)
+        dt = jnp.minimum(dt, jnp.min(ahead, axis=-1))
+    return dt
 
 
 def _size(state: Any, tolerance: Any, shape: tuple) -> Array:
