@@ -295,7 +295,10 @@ class Scene(eqx.Module):
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
-        motion = Partial(free_motion, as_module(method))
+        method = as_module(method)
+        if getattr(method, "subdivides", False):
+            method.demand_prompt(self)
+        motion = Partial(free_motion, method)
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.lanes import any_lane, wide
 from physjax.particles import demand_particles
-from physjax.scene import as_module
+from physjax.scene import as_module, project
 from physjax.vectors import norm
 
 SAFETY, LECTURE_SAFETY, SHRINK, GROW = 0.8, 0.9, 0.2, 5.0
@@ -57,6 +57,21 @@ class Adaptive(eqx.Module):
     def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
+
+    def demand_prompt(self, scene: Any) -> None:
+        """Raise a ValueError where something is answered once a dt, whatever the steps in it: its time would not be kept."""
+        late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if hasattr(f, "advance")]
+        late += [
+            f"{type(contact).__name__} with response=contacts.project"
+            for contact in scene.contacts
+            if (contact.response or project) is project
+        ]
+        if late:
+            raise ValueError(
+                f"adaptive: got {late[0]}, which acts once a dt and not in the steps that a tolerance chooses; expected "
+                "contacts timed by contacts.impact, and forces that forget. Use equal steps, such as methods.rk4 with a "
+                "small dt."
+            )
 
     def report(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Steps:
         """The state a dt later, with the counts of accepted and rejected steps."""
@@ -200,7 +215,8 @@ def adaptive(
     keeps the halves, otherwise the step is redone; the next is 0.8 E^(-1/(p+1)) times as long, p the method's order, at
     most 5 times, and less where the error has been growing. Every independent lane has steps of its own, and all land
     exactly on the end of dt: 3 times the evaluations of the method a try, and two to begin a dt with, so give it long
-    ones.
+    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`). Forces that remember and touches answered by
+    `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
 
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
@@ -269,6 +285,8 @@ def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
 
     """When forces of a system jump, after t [s]: `(*shape, k)` each, or with axes of length 1 where all share them."""
+
+
 def _jumps(system: Any, t: ArrayLike, shape: tuple) -> list[Array]:
     """When forces of a system jump, after t [s]: `(*shape, k)` each."""
     found = []

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Force, Particles, Scene, forces, methods, simulate
+from physjax import Force, Particles, Scene, contacts, forces, methods, simulate, springs
 from physjax.scenes import SCENES
 
 RK4 = methods.adaptive(methods.rk4, 1e-8, 1e-8)
@@ -238,3 +238,46 @@ def test_the_derivative_by_when_a_kick_comes_is_minus_its_velocity():
 
     assert jax.jvp(lambda at: end(at, None), (0.1,), (1.0,))[1] == pytest.approx(-2.0, abs=1e-9)
     assert jax.grad(end)(0.1, 12) == pytest.approx(-2.0, abs=1e-9)
+
+
+def overstretched():
+    """Two masses that a spring lets go at a tenth of its length, which they pass in the middle of a swing of 1 s."""
+    swing = Particles(jnp.asarray([[0.0, 0.0], [1.0, 0.0]]), jnp.asarray([[-1.0, 0.0], [1.0, 0.0]]))
+    return Scene(swing, forces=(springs.Springs([[0, 1]], 2 * np.pi**2, 1.0, breaks_at=0.1),))
+
+
+def tied_over_a_floor():
+    tied = Particles(jnp.asarray([[0.0, 1.0], [1.0, 1.0]]), jnp.zeros((2, 2)))
+    floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.8)
+    return Scene(tied, forces=(forces.Gravity(), springs.Springs([[0, 1]], 10.0, 1.0)), contacts=(floor,))
+
+
+@pytest.mark.parametrize(("build", "what"), [(overstretched, "remembers"), (tied_over_a_floor, r"contacts\.project")])
+def test_what_acts_once_a_dt_is_refused_plainly(build, what):
+    with pytest.raises(ValueError, match=what):
+        simulate(build(), RK4, dt=0.3, steps=4)
+    with pytest.raises(ValueError, match="equal steps"):
+        methods.count_steps(build(), RK4, dt=0.3, steps=4)
+
+
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="'The crown of speed against accuracy': inner steps do not let springs break"
+)
+def test_a_spring_breaks_within_a_dt():
+    run = simulate(overstretched(), RK4, dt=1.0, steps=1)
+    assert not bool(run.final_scene.forces[0].unbroken[0])
+    # relative x = sin(2πt)/π reaches 0.1 at t, and from there both fly on
+    t = np.arcsin(0.1 * np.pi) / (2 * np.pi)
+    away = 0.05 + np.cos(2 * np.pi * t) * (1 - t)
+    np.testing.assert_allclose(run.position[-1, :, 0], [-away, 1 + away], atol=1e-5)
+
+
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="'The crown of speed against accuracy': inner steps do not answer touches"
+)
+def test_balls_that_are_tied_bounce_within_a_dt():
+    run = simulate(tied_over_a_floor(), RK4, dt=0.3, steps=4)
+    # down, up and down again with 0.8 of the speed, and up with 0.64
+    down = np.sqrt(2 / 9.8)
+    since = 1.2 - 2.6 * down
+    np.testing.assert_allclose(run.position[-1, :, 1], 0.64 * 9.8 * down * since - 4.9 * since**2, atol=1e-4)
