@@ -221,7 +221,10 @@ class Scene(eqx.Module):
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
-        motion = Partial(free_motion, as_module(method))
+        method = as_module(method)
+        if getattr(method, "subdivides", False):
+            method.demand_prompt(self)
+        motion = Partial(free_motion, method)
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
@@ -270,8 +273,9 @@ def traced_once(response: Callable) -> Callable:
 
 
 def free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
-    """A step of the method as if nothing were in the way."""
-    return scene.having(state=scene.settled(method(scene.during(t, dt), t, scene.state, dt)))
+    """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
+    seen = scene if getattr(method, "subdivides", False) else scene.during(t, dt)
+    return scene.having(state=scene.settled(method(seen, t, scene.state, dt)))
 
 
 def loads(scene: Scene, t: ArrayLike, state: Any = None, *, per_term: bool = False) -> Any:

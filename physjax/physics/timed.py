@@ -114,7 +114,8 @@ class Control(Force):
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
         """Times at which the force jumps or bends [s]."""
-        return (self._knots(self.at, self.duration),)
+        knots = self._knots(self.at, self.duration)
+        return (knots if knots.ndim > 1 else knots[None],)  # the same for all lanes, however many knots there are
 
     def _knots(self, at: Array, duration: Array) -> Array:
         """When the pieces begin, and when the last one ends [s], behind the axes of the lanes."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.lanes import any_lane, wide
 from physjax.particles import demand_particles
-from physjax.scene import as_module
+from physjax.scene import as_module, project
 from physjax.vectors import norm
 
 SAFETY, LECTURE_SAFETY, SHRINK, GROW = 0.8, 0.9, 0.2, 5.0
@@ -40,9 +40,11 @@ class Steps(NamedTuple):
 class Adaptive(eqx.Module):
     """A method that takes each of its steps whole and in two halves, and calls the difference its error.
 
-    Made by `adaptive`; `report` also tells the steps it took.
+    Made by `adaptive`; `report` also tells the steps it took. Steps end where a force of the system jumps, and each sees
+    the mean over itself of what jumps in it: the system is asked for it, as it was before any step.
     """
 
+    subdivides: ClassVar[bool] = True
     method: Any
     atol: Float[Array, ""]
     rtol: Float[Array, ""]
@@ -55,6 +57,21 @@ class Adaptive(eqx.Module):
     def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
+
+    def demand_prompt(self, scene: Any) -> None:
+        """Raise a ValueError where something is answered once a dt, whatever the steps in it: its time would not be kept."""
+        late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if hasattr(f, "advance")]
+        late += [
+            f"{type(contact).__name__} with response=contacts.project"
+            for contact in scene.contacts
+            if (contact.response or project) is project
+        ]
+        if late:
+            raise ValueError(
+                f"adaptive: got {late[0]}, which acts once a dt and not in the steps that a tolerance chooses; expected "
+                "contacts timed by contacts.impact, and forces that forget. Use equal steps, such as methods.rk4 with a "
+                "small dt."
+            )
 
     def report(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Steps:
         """The state a dt later, with the counts of accepted and rejected steps."""
@@ -70,7 +87,9 @@ class Adaptive(eqx.Module):
             state=state, elapsed=jnp.zeros(shape, kind), h=lax.stop_gradient(h), accepted=none, rejected=none, shortest=dt,
             failed=jnp.zeros(shape, bool), last=jnp.full(shape, jnp.inf, kind), error=jnp.ones(shape, kind),
         )  # fmt: skip
-        attempt = partial(self._attempt, system, t, dt, floor, ceiling)
+        attempt = partial(
+            self._attempt, system, t, dt, partial(_next_stop, _jumps(system, t, shape), dt), floor, ceiling
+        )
         if self.tries is None:
             end = lax.while_loop(lambda walk: any_lane(walk.going(dt)), attempt, start)
         else:
@@ -80,17 +99,20 @@ class Adaptive(eqx.Module):
         state = jax.tree.map(lambda leaf: leaf * wide(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state)
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
-    def _attempt(self, system: Any, t: Any, dt: Any, floor: Any, ceiling: Any, walk: "_Walk") -> "_Walk":
+    def _attempt(
+        self, system: Any, t: Any, dt: Any, next_stop: Callable, floor: Any, ceiling: Any, walk: "_Walk"
+    ) -> "_Walk":
         """One step whole and in halves, kept if both agree, and the next length from how well they do."""
-        going, left = walk.going(dt), dt - walk.elapsed
+        stop = next_stop(walk.elapsed)
+        going, left = walk.going(dt), stop - walk.elapsed
         # two equal steps to the end rather than a long and a tiny one
         last = walk.h >= left
         h = jnp.where(last, left, jnp.where(2 * walk.h > left, left / 2, walk.h))
         h = jnp.where(going, h, 0.0)
         now = t + walk.elapsed
-        whole = self.method(system, now, walk.state, h)
-        middle = self.method(system, now, walk.state, h / 2)
-        halves = self.method(system, now + h / 2, middle, h / 2)
+        whole = self._stepped(system, now, walk.state, h)
+        middle = self._stepped(system, now, walk.state, h / 2)
+        halves = self._stepped(system, now + h / 2, middle, h / 2)
         error = lax.stop_gradient(self._error(walk.state, whole, halves, h.shape))
         good = going & (error <= 1.0)
         bad = going & ~good
@@ -99,7 +121,7 @@ class Adaptive(eqx.Module):
         longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
         return _Walk(
             state=jax.tree.map(lambda a, b: jnp.where(wide(good, a), a, b), halves, walk.state),
-            elapsed=jnp.where(good, jnp.where(last, dt, walk.elapsed + h), walk.elapsed),
+            elapsed=jnp.where(good, jnp.where(last, stop, walk.elapsed + h), walk.elapsed),
             h=jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
             accepted=walk.accepted + good.astype(jnp.int32),
             rejected=walk.rejected + bad.astype(jnp.int32),
@@ -108,6 +130,13 @@ class Adaptive(eqx.Module):
             last=jnp.where(good, h, walk.last),
             error=jnp.where(good, error, walk.error),
         )
+
+    def _stepped(self, system: Any, t: Any, state: Any, h: Any) -> Any:
+        """One step of the method, with what jumps in time replaced by its mean over the step."""
+        if hasattr(system, "during"):
+            # over no time there is no mean, and what is not a number would come back in a derivative
+            system = system.during(t, jnp.where(h > 0, h, 1.0))
+        return self.method(system, t, state, h)
 
     def _factor(self, walk: "_Walk", h: Array, error: Array, good: Array) -> Array:
         """By how much longer the next step may be: as this error allows, or less where errors have been growing.
@@ -187,7 +216,8 @@ def adaptive(
     keeps the halves, otherwise the step is redone; the next is 0.8 E^(-1/(p+1)) times as long, p the method's order, at
     most 5 times, and less where the error has been growing. Every independent lane has steps of its own, and all land
     exactly on the end of dt: 3 times the evaluations of the method a try, and two to begin a dt with, so give it long
-    ones.
+    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`). Forces that remember and touches answered by
+    `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
 
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
@@ -249,11 +279,32 @@ def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
     def one(arrays, i):
         scene = eqx.combine(arrays, still)
         t = i.astype(scene.state.dtype) * dt
-        told = method.report(scene.during(t, dt), t, scene.state, dt)
+        told = method.report(scene, t, scene.state, dt)
         after = scene.step(method, t, dt)
         return eqx.filter(after, eqx.is_array), told._replace(state=after.state)
 
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
+
+    """When forces of a system jump, after t [s]: `(*shape, k)` each, or with axes of length 1 where all share them."""
+
+
+def _jumps(system: Any, t: ArrayLike, shape: tuple) -> list[Array]:
+    """When forces of a system jump, after t [s]: `(*shape, k)` each."""
+    found = []
+    for force in getattr(system, "forces", ()):
+        for times in getattr(force, "discontinuities", tuple)():
+            own = shape and times.shape[: len(shape)] == shape
+            times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
+            found.append(times - jnp.broadcast_to(t, shape)[..., None])
+    return found
+
+
+def _next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
+    """The end of dt, or the first jump before it that has not been reached."""
+    for times in jumps:
+        ahead = jnp.where(times > elapsed[..., None], times, jnp.inf)
+        dt = jnp.minimum(dt, jnp.min(ahead, axis=-1))
+    return dt
 
 
 def _size(state: Any, tolerance: Any, shape: tuple) -> Array:

@@ -1,10 +1,12 @@
 """Whether small deviations from a state grow, measured by running the scene: the test of every prediction.
 
 A scene that is not at rest moves on meanwhile, and its deviations grow and shrink with where it goes. So that a limit
-belongs to a state, what is run is the deviation alone, pushed by the forces it adds to those of that state.
+belongs to a state, what is run is the deviation alone, pushed by the forces it adds to those of that state; what of it
+grows whatever the method is taken out after every step.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +19,7 @@ from jaxtyping import Array
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.scene import Force, Particles, Scene, as_module
-from physjax.study.small_motion import about, small_motion
+from physjax.study.small_motion import SmallMotion, about, follows_rates, small_motion, weight_of
 from physjax.vectors import scale
 
 SMALL = 1e-10
@@ -39,8 +41,8 @@ def measure_limit(
     """The largest dt [s] at which `steps` steps do not make a small deviation from a state grow: by batched bisection.
 
     About the scene's state, if none is given, and shaped like `scene.status_shape`. Slow growth needs many `steps` to
-    be seen: a method that is never stable shows the dt up to which nobody notices; what grows by itself
-    (`grows_by_itself`) shows nothing of the method. Looks `between` two steps [s], by default five decades around the
+    be seen: a method that is never stable shows the dt up to which nobody notices. What grows by itself
+    (`grows_by_itself`) is left out. Looks `between` two steps [s], by default five decades around the
     fastest rate of the scene; 0 or infinity where the limit is outside.
 
     Example:
@@ -90,13 +92,13 @@ def measure_growth(
 
 
 def _range(scene: Scene, state: Particles) -> tuple[np.ndarray, np.ndarray]:
-    pace = _pace(scene, state)
+    pace = _pace(small_motion(scene, state))
     return 1e-3 / pace, 1e2 / pace
 
 
-def _pace(scene: Scene, state: Particles) -> np.ndarray:
+def _pace(motion: SmallMotion) -> np.ndarray:
     """The fastest rate of each scene [1/s]; 1 where nothing swings or decays."""
-    fastest = np.abs(small_motion(scene, state).rates()).max(axis=-1)
+    fastest = motion.pace()
     return np.where(fastest > 0, fastest, 1.0)
 
 
@@ -132,14 +134,17 @@ def _deviations(scene: Scene, method: Callable, dt: Any, at: Particles | None, s
         status = scene.status_shape
         leading = dt.shape[: dt.ndim - len(status)] if dt.ndim > len(status) else ()
         trials = np.broadcast_to(dt, (*leading, *status)).reshape((-1, *status))
-        pace = jnp.asarray(_pace(scene, state))
-        found = _run(scene, state, as_module(method), pace, jnp.asarray(trials), steps)
+        motion = small_motion(scene, state)
+        method = as_module(method)
+        pace, growing = jnp.asarray(_pace(motion)), motion.growing(motion.undamped and not follows_rates(method))
+        own = None if growing is None else (growing, motion.basis)
+        found = _run(scene, state, method, pace, own, jnp.asarray(trials), steps)
         return tuple(np.asarray(a).reshape((*leading, *status)) for a in found)
 
 
 @eqx.filter_jit
 def _run(
-    scene: Scene, state: Particles, method: Any, pace: Array, dts: Array, steps: int
+    scene: Scene, state: Particles, method: Any, pace: Array, own: Any, dts: Array, steps: int
 ) -> tuple[Array, Array, Array]:
     x, v = state
     reach = jnp.maximum(jnp.max(jnp.abs(x - jnp.mean(x))), jnp.max(jnp.abs(v)) / jnp.max(pace))
@@ -150,13 +155,15 @@ def _run(
     start = Particles(push, scale(pace, speed))
     if scene.held is not None:
         start = jax.tree.map(lambda leaf: scale(1 - scene.held.astype(x.dtype), leaf), start)
+    rest = (lambda state: state) if own is None else partial(_without, own, scene)
+    start = rest(start)
     deviation = Scene(start, mass=scene.mass, forces=(_Added(scene, state),), pinned=scene.held)
     inner = (-2, -1) if scene.couples else -1
 
     def run(dt):
         def step(i, carry):
             state, worst = carry
-            state = deviation.having(state=state).step(method, i.astype(x.dtype) * dt, dt).state
+            state = rest(deviation.having(state=state).step(method, i.astype(x.dtype) * dt, dt).state)
             apart = jnp.max(jnp.abs(state.velocity), axis=inner)
             apart = jnp.where(jnp.isfinite(apart), apart, jnp.inf)
             spans = (i < 4, i < steps // 2, i >= steps // 2)
@@ -167,3 +174,16 @@ def _run(
         return lax.fori_loop(0, steps, step, (deviation.state, (zero, zero, zero)))[1]
 
     return jax.vmap(run)(dts)
+
+
+def _without(own: tuple, scene: Scene, state: Particles) -> Particles:
+    """A deviation less what it has of motions that grow by themselves."""
+    growing, basis = own
+    weight = weight_of(scene, state)
+    blocks = growing.shape[:-2]
+    both = [(leaf * weight).reshape((*blocks, -1)) for leaf in state]
+    seen = both if basis is None else [jnp.einsum("...ij,...j->...i", basis, a) for a in both]
+    grown = jnp.einsum("...ij,...j->...i", growing, jnp.concatenate(seen, axis=-1))
+    parts = jnp.split(grown, 2, axis=-1)
+    parts = parts if basis is None else [jnp.einsum("...ij,...i->...j", basis, a) for a in parts]
+    return Particles(*(leaf - a.reshape(leaf.shape) / weight for leaf, a in zip(state, parts, strict=True)))

@@ -15,12 +15,18 @@ from physjax.checks import real_quantity
 from physjax.physics.springs import Springs
 from physjax.scene import Force, Particles, Scene, as_module
 from physjax.show.report import seconds_text
-from physjax.study.small_motion import SmallMotion, about, follows_rates, radius, rate_text, small_motion, step_matrices
+from physjax.study.small_motion import (
+    RESTING,
+    ROUNDING,
+    SmallMotion,
+    about,
+    follows_rates,
+    radius,
+    rate_text,
+    small_motion,
+    step_matrices,
+)
 
-RESTING = 1e-6
-"""Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
-ROUNDING = 1e-9
-"""The real part, in parts of the fastest rate, that is none."""
 SEEN = 1e-6
 """Growth of a step matrix's eigenvalue that rounding, which splits the double ones, cannot feign."""
 
@@ -134,9 +140,9 @@ def growth(scene: Scene, method: Callable, dt: Any, at: Particles | None = None)
         motion, method = small_motion(scene, state), checked_method(method)
         dt = np.broadcast_to(np.asarray(real_quantity("dt [s]", dt, above=0.0), float), scene.status_shape)
         if motion.undamped or follows_rates(method):
-            z = _swinging(motion) * dt[..., None]
+            z = _swinging(motion, method) * dt[..., None]
             return np.asarray(radius(method, jnp.asarray(z))).max(axis=-1, initial=1.0)
-        return np.maximum(1.0, _growths(method, motion, dt).max(axis=-1))
+        return np.maximum(1.0, _growths(method, motion, dt, _without_own_growth(motion)).max(axis=-1))
 
 
 def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
@@ -167,23 +173,24 @@ def checked_method(method: Callable) -> Any:
     return as_module(method)
 
 
-def _swinging(motion: SmallMotion) -> np.ndarray:
+def _swinging(motion: SmallMotion, method: Any) -> np.ndarray:
     """Rates without those of drifts and of motions that grow by themselves, set to 0; rounding taken off undamped ones.
 
     Without damping a mode that grows has a partner that decays: a body that falls from a hilltop, and one that climbs it.
+    Methods that kick and drift keep both at any step.
     """
     rates = motion.rates()
     fastest = np.abs(rates).max(axis=-1, keepdims=True)
     rates = np.where(np.abs(rates.real) < ROUNDING * fastest, 1j * rates.imag, rates)
     gone = (np.abs(rates) < RESTING * fastest) | (rates.real > 0)
-    if motion.undamped:
+    if motion.undamped and not follows_rates(method):
         gone |= rates.real != 0
     return np.where(gone, 0.0, rates)
 
 
 def _limits_by_rates(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
     """The limit of each block where the rates decide: the first λ dt on its ray that leaves the region."""
-    swinging = _swinging(motion)
+    swinging = _swinging(motion, method)
     speed = np.abs(swinging)
     directions = np.where(speed > 0, swinging / np.where(speed > 0, speed, 1.0), -1.0)
     reach = _reach(method, directions)
@@ -219,10 +226,8 @@ def _reach(method: Any, directions: np.ndarray) -> np.ndarray:
 def _limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
     """The limit of each block by the eigenvalues of the step itself: doubled until one leaves 1, then halved."""
     pace = np.where(fastest > 0, fastest, 1.0)
-    rates = motion.rates()
-    # what grows by itself does so in a step as well, not quite as fast: it is counted, and one more is the method's doing
-    allowed = np.sum(rates.real > RESTING * pace[..., None], axis=-1)
-    grows = lambda dt: np.sum(_growths(method, motion, dt) > 1 + SEEN, axis=-1) > allowed  # noqa: E731
+    rates, rest = motion.rates(), _without_own_growth(motion)
+    grows = lambda dt: np.any(_growths(method, motion, dt, rest) > 1 + SEEN, axis=-1)  # noqa: E731
     low, high, out = np.zeros(pace.shape), 0.01 / pace, np.zeros(pace.shape, bool)
     for _ in range(15):
         out = out | grows(high)
@@ -238,7 +243,7 @@ def _limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> t
     def worst_mode(block):
         n = motion.stiffness.shape[-1]
         dt = np.where(out, high * 1.01, 1 / pace)
-        μ, modes = np.linalg.eig(_matrices(method, motion, dt)[block])
+        μ, modes = np.linalg.eig(_matrices(method, motion, dt, rest)[block])
         # of those that leave, the one that is furthest from what the scene does by itself
         strange = np.abs(μ[:, None] - np.exp(rates[block] * dt[block])).min(axis=-1)
         leaves = np.abs(μ) > 1 + SEEN
@@ -248,17 +253,28 @@ def _limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> t
     return limits, worst_mode
 
 
-def _matrices(method: Any, motion: SmallMotion, dt: np.ndarray) -> np.ndarray:
-    """The step's matrix of each block."""
+def _without_own_growth(motion: SmallMotion) -> np.ndarray | None:
+    """What takes the part out of a motion that grows whatever the method, for each block; None where nothing grows.
+
+    A step of what is left is the method's doing alone. To compare eigenvalues instead would need to know which of the
+    step's belongs to which of the motion's, and a slow growth is soon lost among drifts.
+    """
+    growing = motion.growing()
+    return None if growing is None else np.eye(growing.shape[-1]) - growing
+
+
+def _matrices(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
+    """The step's matrix of each block, of `rest` alone where there is such."""
     n = motion.stiffness.shape[-1]
     flat = [jnp.asarray(a.reshape(-1, n, n)) for a in motion[:2]]
     found = step_matrices(method, *flat, jnp.asarray(np.reshape(dt, -1)))
-    return np.asarray(found).reshape(*motion.stiffness.shape[:-2], 2 * n, 2 * n)
+    found = np.asarray(found).reshape(*motion.stiffness.shape[:-2], 2 * n, 2 * n)
+    return found if rest is None else rest @ found @ rest
 
 
-def _growths(method: Any, motion: SmallMotion, dt: np.ndarray) -> np.ndarray:
+def _growths(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
     """The size of each eigenvalue of each block's step; the double 1 of a drift, which rounding splits, counts as 1."""
-    μ = np.linalg.eigvals(_matrices(method, motion, dt))
+    μ = np.linalg.eigvals(_matrices(method, motion, dt, rest))
     return np.where(np.abs(μ - 1) < 1e-5, 1.0, np.abs(μ))
 
 

@@ -30,11 +30,15 @@ class Norm(NamedTuple):
 
     def moments(self, scene: Scene, times: np.ndarray, states: Any, truth: Any, scale: Any = None) -> np.ndarray:
         """The error at each moment, of the worst unit, `(moments,)`; in parts of `scale` where it is given."""
+        return self.units(scene, times, states, truth, scale).max(axis=1)
+
+    def units(self, scene: Scene, times: np.ndarray, states: Any, truth: Any, scale: Any = None) -> np.ndarray:
+        """The error at each moment of each unit in a row, `(moments, units)`."""
         off = self.quantity(scene, times, states) - self.quantity(scene, times, truth)
         with np.errstate(invalid="ignore", over="ignore"):
             length = np.sqrt(np.sum(off**2, axis=-1))
         size = self.size(scene, times, truth) if scale is None else np.asarray(scale, float)
-        return (length / np.where(size > 0, size, 1.0)).reshape(len(length), -1).max(axis=1)
+        return (length / np.where(size > 0, size, 1.0)).reshape(len(length), -1)
 
     def error(self, scene: Scene, times: np.ndarray, states: Any, truth: Any, scale: Any = None) -> float:
         """The error of a run: at its worst moment."""

@@ -47,6 +47,8 @@ SURE = {"float64": 0.9, "float32": 0.6}
 """The part of an error that a run may have to be recommended; rounding differs from one compilation to the next."""
 KNOWN = 0.3
 """An error can be promised if the truth itself is right to this part of it."""
+CHAOTIC = 1e6
+"""So many times an error of the start has grown where one speaks of chaos; what drifts apart in time stays below."""
 FINALISTS, CLOSE = 3, 4.0
 """Methods that are verified and timed for an error, by what their runs predict, if not so many times slower than others."""
 
@@ -346,13 +348,17 @@ def _obstacle(question: Question, found: list[Explored], wanted: float, doubt: f
     horizon = truth.horizon(wanted, 10 * float(np.finfo(float).eps), question.norm, question.scale)
     least = min((t.error for entry in found for t in entry.trials), default=np.inf)
     if np.isfinite(horizon):
+        grown = float(truth.growth(question.norm, question.scale).max())
+        what = "Chaos" if grown > CHAOTIC else "Rounding"
         return (
-            f"Chaos: beyond {seconds_text(horizon)} rounding alone has grown to an error of {wanted:g}; no method can."
+            f"{what}: beyond {seconds_text(horizon)} rounding alone has grown to an error of {wanted:g}; no method can."
         )
     if doubt > KNOWN * wanted:
         cause = "springs that break" if remembers(scene) else "touches answered at the end of a step"
         why = f" ({cause} leave every method at first order)" if answers_late(scene) else ""
-        return f"The true path itself is known only to {doubt:.1e}{why}; {wanted:g} cannot be promised."
+        unit, kind = truth.least_known(question.norm, question.scale), "scene" if scene.couples else "lane"
+        where = "" if unit is None else f", worst in {kind} {unit}"
+        return f"The true path itself is known only to {doubt:.1e}{where}{why}; {wanted:g} cannot be promised."
     if least <= SURE["float64"] * wanted - doubt:
         what = (
             "no time was left to compile it in float32"

@@ -134,6 +134,20 @@ def smallest_size(scene: Scene) -> float:
     return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
 
 
+def smallest_sizes(scene: Scene) -> np.ndarray:
+    """`smallest_size` for each lane, smaller where all of the lane is small beside the others; once a coupled scene.
+
+    Shaped to meet a leaf of the state.
+    """
+    axes, ratios = (-2, -1) if scene.couples else (-1,), []
+    for leaf in map(np.asarray, jax.tree.leaves((scene.state, _driven(scene, scene.state)))):
+        whole = np.sqrt(np.mean(np.square(leaf)))
+        if whole > 0:
+            ratios.append(np.sqrt(np.mean(np.square(leaf), axis=axes, keepdims=True)) / whole)
+    ratio = np.max(ratios, axis=0) if ratios else np.ones(1)
+    return smallest_size(scene) * np.where(ratio > 0, np.minimum(ratio, 1.0), 1.0)
+
+
 def depends_on_velocity(scene: Scene) -> bool:
     """Whether the forces look at the velocity: the promise of some methods depends on it."""
     with jax.enable_x64(True):

@@ -52,7 +52,7 @@ class Question(NamedTuple):
         )
 
     def _of(self, norm: Norm, states: Any, truth: Any, scale: Any) -> float:
-        error = norm.error(self.truth.scene, self.truth.times, states, truth, scale)
+        error = norm.error(self.truth.scene, self.truth.times, states, truth, self.truth.size(norm, scale))
         return error if np.isfinite(error) else float("inf")
 
 
@@ -210,5 +210,6 @@ def second_opinion(question: Question, entry: Contender, trial: Trial) -> float:
     factor = TIGHTEN ** (1 + 1 / order) if entry.adaptive else REFINE
     here, finer = (jax.tree.map(np.asarray, entry(f)) for f in (trial.fineness, trial.fineness * factor))
     here, finer = ((found if question.push is None else found[0]) for found in (here, finer))
-    change = question.norm.error(question.truth.scene, question.truth.times, here, finer, question.scale)
+    size = question.truth.size(question.norm, question.scale)
+    change = question.norm.error(question.truth.scene, question.truth.times, here, finer, size)
     return change / (1 - 2.0**-order)

@@ -25,6 +25,12 @@ KRYLOV = 60
 """Vectors for the fastest modes of stiffness and as many for damping."""
 
 
+RESTING = 1e-6
+"""Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
+ROUNDING = 1e-9
+"""The real part, in parts of the fastest rate, that is none."""
+
+
 class SmallMotion(NamedTuple):
     """Stiffness K [1/s²] and damping C [1/s] in coordinates √m δx, `(*blocks, n, n)`: a block for each entry of a status.
 
@@ -43,6 +49,40 @@ class SmallMotion(NamedTuple):
     def modes(self, block: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues of one block and its modes as columns: positions above, velocities below."""
         return np.linalg.eig(self._rate_matrix()[block])
+
+    def growing(self, partners: bool = False) -> np.ndarray | None:
+        """What a motion has of those that grow by themselves, as matrices on (d, ḋ), `(*blocks, 2n, 2n)`; None without.
+
+        Growth is e^(λt) however slow, but for drifts. The matrices are projections along all the other modes, so that
+        without that part a motion goes on as if none of it grew. With `partners` they take what decays as fast as
+        another grows as well: the same displacements, without damping.
+        """
+        # in units in which both halves of the fastest motion are as large
+        fastest = self.pace()
+        pace = np.where(fastest > 0, fastest, 1.0)
+        unit = np.concatenate([np.broadcast_to(a, self.stiffness.shape[:-1]) for a in (pace[..., None], 1.0)], axis=-1)
+        scaled = self._rate_matrix() * unit[..., :, None] / unit[..., None, :]
+        found = np.zeros_like(scaled)
+        for block in np.ndindex(scaled.shape[:-2]):
+            λ, right = np.linalg.eig(scaled[block])
+            size = np.abs(λ.real) if partners else λ.real
+            grows = (size > ROUNDING * pace[block]) & (np.abs(λ) > RESTING * pace[block])
+            if not grows.any():
+                continue
+            same, left = np.linalg.eig(scaled[block].T)
+            # of a matrix and its transpose the same eigenvalues, the nearest to each
+            matched = []
+            for number in λ[grows]:
+                apart = np.abs(same - number)
+                apart[matched] = np.inf
+                matched.append(int(np.argmin(apart)))
+            right, left = right[:, grows], left[:, matched]
+            found[block] = (right @ np.linalg.solve(left.T @ right, left.T)).real
+        return found / unit[..., :, None] * unit[..., None, :] if found.any() else None
+
+    def pace(self) -> np.ndarray:
+        """The fastest rate of each block [1/s]."""
+        return np.abs(self.rates()).max(axis=-1)
 
     def displacement(self, block: tuple[int, ...], mode: np.ndarray) -> np.ndarray:
         """The positions of a mode of a block, `(coordinates,)` complex, of length 1."""
@@ -117,7 +157,7 @@ def _orthonormal(vector: np.ndarray, basis: list[np.ndarray]) -> tuple[np.ndarra
 @eqx.filter_jit
 def _push(scene: Scene, state: Particles, moved: Array, speed: Array) -> Array:
     """K d + C ḋ for coordinates d and ḋ, `(*blocks, n)`."""
-    weight = _weight(scene, state)
+    weight = weight_of(scene, state)
     tangent = Particles(*(_free(scene, a.reshape(state.position.shape)) / weight for a in (moved, speed)))
     change = jax.jvp(lambda s: scene.acceleration(jnp.zeros((), s.dtype), s), (state,), (tangent,))[1]
     return -(weight * _free(scene, change)).reshape(moved.shape)
@@ -133,7 +173,8 @@ def _dense(scene: Scene, state: Particles, size: int) -> tuple[Array, Array]:
     return tuple(jnp.moveaxis(a, 0, -1) for a in jnp.split(columns, 2))
 
 
-def _weight(scene: Scene, state: Particles) -> Array:
+def weight_of(scene: Scene, state: Particles) -> Array:
+    """√m for each component of each lane: what makes a displacement a coordinate."""
     return jnp.broadcast_to(jnp.sqrt(scene.mass)[..., None], state.position.shape)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, forces, methods, simulate
+from physjax import Force, Particles, Scene, contacts, forces, methods, simulate, springs
 from physjax.scenes import SCENES
 
 RK4 = methods.adaptive(methods.rk4, 1e-8, 1e-8)
@@ -186,3 +186,115 @@ def test_bad_input_is_refused(unannotated):
         methods.adaptive(methods.rk4, error="speed")
     with pytest.raises(TypeError, match=r"expected methods\.adaptive"):
         methods.count_steps(thrown(), methods.rk4, dt=1.0, steps=1)
+
+
+# what jumps, from rest on 1 kg, and where it is after 1 s in closed form
+JUMPS = [
+    (lambda: forces.Kick((1.0,), at=0.1, duration=0.01), 0.895),
+    (lambda: forces.Control([[1.0], [-1.0], [3.0]], duration=0.9), 0.315),
+    # its means over the whole and over both halves tell nothing
+    (lambda: forces.Control([[1.0], [-1.0], [-1.0], [1.0], [1.0], [-1.0], [-1.0], [1.0], [2.0]], duration=0.9), 0.03),
+    (lambda: forces.Control([[0.0], [2.0], [0.0]], duration=0.8, at=0.1, linear=True), 0.4),
+]
+
+
+@pytest.mark.parametrize(("build", "right"), JUMPS)
+def test_what_jumps_arrives_whole_and_on_time_however_long_the_dt(build, right):
+    scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(build(),))
+    loose = methods.adaptive(methods.rk4, 1e-3, 1e-3)
+    for method, dt in ((loose, 1.0), (RK4, 0.5)):
+        run = simulate(scene, method, dt=dt, steps=round(1 / dt))
+        assert run.ok
+        assert float(run.position[-1, 0]) == pytest.approx(right, abs=1e-9)
+
+
+def test_a_blast_under_error_control_is_that_of_fine_equal_steps():
+    blast = forces.Blast((-1.0,), 4.0, 1.0, at=0.1, duration=0.01)
+    scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(blast,))
+    fine = simulate(scene, methods.rk4, dt=2e-3, steps=500, save_every=500)
+    assert float(simulate(scene, RK4, dt=1.0, steps=1).position[-1, 0]) == pytest.approx(
+        float(fine.position[-1, 0]), abs=1e-7
+    )
+
+
+def test_each_lane_stops_at_its_own_jumps_alone():
+    at = np.array([0.1, 0.2, 0.5])
+    # as many knots as lanes: they belong to all of them
+    push, kick = forces.Control([[1.0], [-1.0]], duration=0.9), forces.Kick((1.0,), at=at, duration=0.01)
+    scene = Scene(Particles(jnp.zeros((3, 1)), jnp.zeros((3, 1))), forces=(push, kick))
+    told = methods.count_steps(scene, methods.adaptive(methods.rk4, 1e-8, 1e-8), dt=1.0, steps=1)
+    np.testing.assert_allclose(told.state.position[0, :, 0], 0.45**2 + 1 - at - 0.005, atol=1e-9)
+    assert int(told.accepted.max()) <= 12
+    many = Scene(
+        Particles(jnp.zeros((300, 1)), jnp.zeros((300, 1))),
+        forces=(forces.Kick((1.0,), at=jnp.linspace(0.1, 0.9, 300), duration=0.01),),
+    )
+    assert int(methods.count_steps(many, RK4, dt=1.0, steps=1).accepted.max()) <= 8
+
+
+def test_a_force_of_ones_own_that_tells_its_mean_but_no_times_is_seen_by_the_error():
+    class Tap(Force):
+        def __call__(self, t, state, mass):
+            return jnp.where((t >= 0.1) & (t < 0.11), 100.0, 0.0) * jnp.ones_like(state.velocity)
+
+        def during(self, t, dt, state):
+            share = jnp.clip(0.11, t, t + dt) - jnp.clip(0.1, t, t + dt)
+            return forces.Constant(100 * share / dt * jnp.ones_like(state.velocity))
+
+    scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(Tap(),))
+    run = simulate(scene, methods.adaptive(methods.rk4, 1e-7, 1e-7), dt=1.0, steps=1)
+    assert run.ok
+    assert float(run.position[-1, 0]) == pytest.approx(0.895, abs=1e-6)
+
+
+def test_the_derivative_by_when_a_kick_comes_is_minus_its_velocity():
+    def end(at, tries):
+        scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(forces.Kick((2.0,), at=at, duration=0.01),))
+        method = methods.adaptive(methods.rk4, 1e-6, 1e-6, tries=tries)
+        return simulate(scene, method, dt=1.0, steps=1).position[-1, 0]
+
+    assert jax.jvp(lambda at: end(at, None), (0.1,), (1.0,))[1] == pytest.approx(-2.0, abs=1e-9)
+    assert jax.grad(end)(0.1, 12) == pytest.approx(-2.0, abs=1e-9)
+
+
+def overstretched():
+    """Two masses that a spring lets go at a tenth of its length, which they pass in the middle of a swing of 1 s."""
+    swing = Particles(jnp.asarray([[0.0, 0.0], [1.0, 0.0]]), jnp.asarray([[-1.0, 0.0], [1.0, 0.0]]))
+    return Scene(swing, forces=(springs.Springs([[0, 1]], 2 * np.pi**2, 1.0, breaks_at=0.1),))
+
+
+def tied_over_a_floor():
+    tied = Particles(jnp.asarray([[0.0, 1.0], [1.0, 1.0]]), jnp.zeros((2, 2)))
+    floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.8)
+    return Scene(tied, forces=(forces.Gravity(), springs.Springs([[0, 1]], 10.0, 1.0)), contacts=(floor,))
+
+
+@pytest.mark.parametrize(("build", "what"), [(overstretched, "remembers"), (tied_over_a_floor, r"contacts\.project")])
+def test_what_acts_once_a_dt_is_refused_plainly(build, what):
+    with pytest.raises(ValueError, match=what):
+        simulate(build(), RK4, dt=0.3, steps=4)
+    with pytest.raises(ValueError, match="equal steps"):
+        methods.count_steps(build(), RK4, dt=0.3, steps=4)
+
+
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="'The crown of speed against accuracy': inner steps do not let springs break"
+)
+def test_a_spring_breaks_within_a_dt():
+    run = simulate(overstretched(), RK4, dt=1.0, steps=1)
+    assert not bool(run.final_scene.forces[0].unbroken[0])
+    # relative x = sin(2πt)/π reaches 0.1 at t, and from there both fly on
+    t = np.arcsin(0.1 * np.pi) / (2 * np.pi)
+    away = 0.05 + np.cos(2 * np.pi * t) * (1 - t)
+    np.testing.assert_allclose(run.position[-1, :, 0], [-away, 1 + away], atol=1e-5)
+
+
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="'The crown of speed against accuracy': inner steps do not answer touches"
+)
+def test_balls_that_are_tied_bounce_within_a_dt():
+    run = simulate(tied_over_a_floor(), RK4, dt=0.3, steps=4)
+    # down, up and down again with 0.8 of the speed, and up with 0.64
+    down = np.sqrt(2 / 9.8)
+    since = 1.2 - 2.6 * down
+    np.testing.assert_allclose(run.position[-1, :, 1], 0.64 * 9.8 * down * since - 4.9 * since**2, atol=1e-4)

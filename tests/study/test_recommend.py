@@ -211,3 +211,47 @@ def test_rigid_bodies_are_advised_as_well():
     )
     flight = advice.simulate()
     assert norms.path.error(problem.scene, problem.times, flight.state, problem.exact(problem.times)) <= 1e-4
+
+
+def test_lanes_of_every_size_are_each_resolved():
+    speed = np.stack([10.0 ** np.arange(-6, 10, 3), np.zeros(6)], axis=-1)
+    scene = Scene(Particles(jnp.zeros((6, 2)), jnp.asarray(speed)), forces=(forces.StokesDrag(0.5),))
+    advice = recommend(scene, error=1e-5, horizon=2.0, methods=FEW, dtypes=[np.float64], progress=False)
+    assert advice.ok, advice.reason
+    assert advice.doubt < 1e-11
+    exact = speed[:, 0] / 0.5 * (1 - np.exp(-0.5 * 2.0))
+    np.testing.assert_allclose(advice.simulate().position[-1, :, 0], exact, rtol=2e-5)
+
+
+def test_a_period_that_divides_the_moments_is_no_chaos():
+    # at each moment it is where it began
+    problem = Problem(spring((2 * np.pi / 0.5) ** 2), 32.0)
+    with jax.enable_x64(True):
+        truth = yardstick(problem)
+    assert truth.doubt().max() < 1e-11
+    assert truth.horizon(1e-6, 1e-15) == np.inf
+    assert truth.reach.max() == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.slow
+def test_dry_friction_is_walked_through_and_never_called_chaos():
+    friction = forces.independent(lambda t, s, m: -2.0 * jnp.sign(s.velocity))
+    scene = Scene(Particles(jnp.zeros((2, 1)), jnp.asarray([[3.0], [5.0]])), forces=(friction,))
+    few = {"horizon": 4.0, "methods": FEW, "dtypes": [np.float64], "progress": False}
+    good, bad = recommend(scene, error=(1e-3, 1e-9), **few)
+    assert good.ok, good.reason
+    np.testing.assert_allclose(good.simulate().position[-1, :, 0], [2.25, 6.25], rtol=2e-3)
+    assert "known only to" in bad.reason
+    assert "worst in lane" in bad.reason
+
+
+@pytest.mark.slow
+def test_what_is_as_far_off_from_a_smaller_nudge_has_not_grown():
+    with jax.enable_x64(True):
+        truth = yardstick(Problem(spring(), 4.0, frames=8))
+    noise = jax.tree.map(lambda leaf: leaf * (1 + np.linspace(0.0, 1.0, 9)[:, None] ** 9), truth.states)
+    jumpy = truth._replace(nudged=noise, less_nudged=lambda: noise)
+    assert jumpy.growth().max() > 1e8
+    assert jumpy.horizon(1e-6, 1e-15) == np.inf
+    near = jax.tree.map(lambda a, b: a + (b - a) / 10, truth.states, noise)
+    assert jumpy._replace(less_nudged=lambda: near).horizon(1e-6, 1e-15) < 4.0

@@ -221,3 +221,31 @@ def test_what_grows_by_itself_sets_no_limit_and_does_not_hide_what_does(method, 
     assert stability.grows_by_itself(scene).all()
     promised = method.promises.stable_to / 10.0
     assert stability.limit(scene, method).dt == pytest.approx(promised, rel=0.05 if b else 1e-6)
+
+
+@pytest.mark.parametrize("method", [methods.semi_implicit_euler, methods.verlet], ids=lambda m: m.__name__)
+def test_a_very_slow_growth_of_the_scenes_own_does_not_excuse_the_method(method):
+    # a damped ring: nodes that move leave a tension a hair below zero, which grows as slowly as the node moves
+    count = 12
+    angle = 2 * np.pi * np.arange(count) / count
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    pairs = [[i, (i + 1) % count] for i in range(count)]
+    net = springs.Springs(pairs, 500.0, 2 * np.sin(np.pi / count), 0.2)
+    mass = np.random.default_rng(7).uniform(0.1, 2, count)
+    push = np.random.default_rng(3).normal(size=ring.shape)
+    moving = [Scene(Particles(jnp.asarray(ring), jnp.asarray(v * push)), mass, (net,)) for v in (0, 1e-8, 1e-6, 1e-3)]
+    still, *others = (stability.limit(scene, method).dt for scene in moving)
+    np.testing.assert_allclose(others, still, rtol=1e-3)
+    # confirmed where a growth of its own does not end the run
+    at = still * np.array([0.98, 1.02])
+    np.testing.assert_array_equal(stability.grows(moving[1], method, at, steps=4000), [False, True])
+
+
+@pytest.mark.parametrize("method", [methods.verlet, methods.rk4], ids=lambda m: m.__name__)
+def test_what_pulls_a_binary_apart_is_left_out_of_its_limit_and_of_the_measured_one(method):
+    pair = Particles(jnp.asarray([[-0.5, 0.0], [0.5, 0.0]]), jnp.asarray([[0.0, -0.7], [0.0, 0.7]]))
+    scene = Scene(pair, forces=(forces.Gravitation(G=1.0),))
+    # √2/s across, which swings; 2/s along, which grows and has a partner that decays
+    known = 2.0 / np.sqrt(2.0) if method is methods.verlet else 2.785293563 / 2.0
+    assert stability.limit(scene, method).dt == pytest.approx(known, rel=1e-6)
+    assert float(stability.measure_limit(scene, method, steps=1000)) == pytest.approx(known, rel=0.02)
