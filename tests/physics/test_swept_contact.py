@@ -78,7 +78,7 @@ def test_no_corner_of_dice_and_rods_passes_a_thin_plate(dtype):
     plate = contacts.Slab((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3, restitution=0.8)
     bodies = rigid.bodies(box, *(jnp.asarray(part, dtype) for part in parts))
     run = simulate(Scene(bodies, box, (), (rigid.Touch(hull, plate),)), methods.rk4, dt=1 / 60, steps=45)
-    corners = jax.vmap(lambda state: hull.arms(state) + state.position)(run.state)
+    corners = jax.vmap(lambda state: hull.arms(state) + state.position[None])(run.state)
     assert run.ok.all()
     assert float(corners[..., 0].max()) < -5e-4 + (1e-9 if dtype == jnp.float64 else 2e-6)
 
