@@ -221,10 +221,7 @@ class Scene(eqx.Module):
 
     def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
-        method = as_module(method)
-        if getattr(method, "subdivides", False):
-            method.demand_prompt(self)
-        motion = Partial(free_motion, method)
+        motion = Partial(free_motion, as_module(method))
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
@@ -274,7 +271,7 @@ def traced_once(response: Callable) -> Callable:
 
 def free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
     """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
-    seen = scene if getattr(method, "subdivides", False) else scene.during(t, dt)
+    seen = method.checked(scene) if hasattr(method, "checked") else scene.during(t, dt)
     return scene.having(state=scene.settled(method(seen, t, scene.state, dt)))
 
 

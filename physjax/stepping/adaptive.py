@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,7 +44,6 @@ class Adaptive(eqx.Module):
     the mean over itself of what jumps in it: the system is asked for it, as it was before any step.
     """
 
-    subdivides: ClassVar[bool] = True
     method: Any
     atol: Float[Array, ""]
     rtol: Float[Array, ""]
@@ -58,8 +57,8 @@ class Adaptive(eqx.Module):
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
 
-    def demand_prompt(self, scene: Any) -> None:
-        """Raise a ValueError where something is answered once a dt, whatever the steps in it: its time would not be kept."""
+    def checked(self, scene: Any) -> Any:
+        """The scene as it is; a ValueError where something is answered once a dt, whatever the steps in it."""
         late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if hasattr(f, "advance")]
         late += [
             f"{type(contact).__name__} with response=contacts.project"
@@ -72,6 +71,7 @@ class Adaptive(eqx.Module):
                 "contacts timed by contacts.impact, and forces that forget. Use equal steps, such as methods.rk4 with a "
                 "small dt."
             )
+        return scene
 
     def report(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Steps:
         """The state a dt later, with the counts of accepted and rejected steps."""
