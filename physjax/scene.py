@@ -2,7 +2,8 @@
 
 Arrays are shaped `(*lanes, dim)`, the component last. Lanes are independent (ten thousand balls) or coupled (bodies
 that attract each other, a cloth's nodes); a force says which. In a coupled scene the last lane axis counts nodes and
-earlier axes count scenes. A per-lane number is a scalar or has the shape of the lanes. SI units, y up.
+earlier axes count scenes. A per-lane number is a scalar or has the shape of the lanes. SI units, y up
+unless a force says otherwise.
 """
 
 from collections.abc import Callable

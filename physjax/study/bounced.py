@@ -37,7 +37,7 @@ def find_bounced(
     right = lax.map(lambda launch: _touches(shots, launch), launches) == bounces
     extent = speed[None] * launches.time
     near = float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent
-    hit = right & (distance <= jnp.maximum(near, shots.rounding(launches)))
+    hit = right & (distance <= jnp.maximum(near, jax.vmap(shots.rounding)(launches)))
     order = jnp.where(late, -launches.time, launches.time)
     # hits come first, by time; then the nearest with the right number of bounces; then the others
     worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0)) + 1

@@ -284,6 +284,16 @@ def test_copies_of_a_scene_move_as_it_does(name):
     np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
 
 
+def ball_on_a_floor():
+    """One particle with a contact that remembers nothing."""
+    one = ball_in_a_room()
+    return Scene(
+        one.state,
+        forces=one.forces,
+        contacts=[replace(one.contacts[0], response=contacts.project, touching_since=None)],
+    )
+
+
 def ball_in_a_room():
     """One particle, whose contact remembers since when it touches which wall."""
     room = contacts.Room((-1.0, 0.0), (1.0, 2.0), restitution=0.8)
@@ -291,10 +301,10 @@ def ball_in_a_room():
 
 
 def balls_in_a_room():
-    """Two, each with a memory and a mass of its own."""
+    """Three, each with a memory and a mass of its own."""
     one = ball_in_a_room()
-    twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), one.state)
-    return Scene(twice, jnp.array([1.0, 2.0]), one.forces, [replace(one.contacts[0], touching_since=None)])
+    thrice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf, leaf]), one.state)
+    return Scene(thrice, jnp.array([1.0, 2.0, 3.0]), one.forces, [replace(one.contacts[0], touching_since=None)])
 
 
 def breaking_rope():
@@ -303,7 +313,14 @@ def breaking_rope():
     return Scene(Particles(rope.state.position.at[2:, 0].add(0.1), rope.state.velocity), rope.mass, (rope.springs,))
 
 
-@pytest.mark.parametrize("build", [ball_in_a_room, balls_in_a_room, breaking_rope])
+@pytest.mark.parametrize(
+    "build",
+    [
+        ball_on_a_floor,
+        breaking_rope,
+        *(pytest.param(b, marks=pytest.mark.slow) for b in (ball_in_a_room, balls_in_a_room)),
+    ],
+)
 def test_copies_remember_each_on_its_own(build):
     run = lambda scene: sample(scene, as_module(methods.verlet), 0.02, jnp.asarray(10), frames=4)  # noqa: E731
     one, many = run(build()), run(copies(build(), 3))

@@ -84,7 +84,12 @@ def passes_made(ball, bounced_axis, count, seed):
     random = np.random.default_rng(seed)
     angle, time = random.uniform(-1.2, 1.4, 8 * count), random.uniform(0.3, 2.2, 8 * count)
     velocity = jnp.asarray(SPEED * np.stack([np.cos(angle), np.sin(angle)], axis=-1), ball.state.dtype)
-    many = Scene(Particles(ball.state.position + 0 * velocity, velocity), ball.mass, ball.forces, ball.contacts)
+    many = Scene(
+        Particles(jnp.broadcast_to(ball.state.position, velocity.shape), velocity),
+        ball.mass,
+        ball.forces,
+        ball.contacts,
+    )
     run = simulate(many, methods.rk4, dt=jnp.asarray(time / 200, velocity.dtype), steps=200)
     kicks = np.abs(np.diff(np.asarray(run.velocity)[..., bounced_axis], axis=0)) > 1.0
     return run.position[-1][kicks.sum(axis=0) == 1][:count]
@@ -107,7 +112,7 @@ def test_no_right_arc_is_denied(what, precision):
     along = jnp.zeros_like(targets).at[:, 0].set(1.0)
     _, moves, shots = jax.jit(lambda t: jax.jvp(aimed, (t,), (along,), has_aux=True))(targets)
     for shot in shots:
-        extent = np.linalg.norm(targets - start, axis=-1) + SPEED * np.asarray(shot.time)
+        extent = np.linalg.norm(targets - start[None], axis=-1) + SPEED * np.asarray(shot.time)
         assert shot.ok.all()
         assert (np.asarray(shot.miss) / extent).max() < 64 * precision.eps
     assert (np.asarray(moves) != 0).all()
