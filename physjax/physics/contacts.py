@@ -145,6 +145,21 @@ class Surface(Contact):
         """Positions as the surface sees them, which thinks that it stands where it was at t = 0."""
         return position if self.velocity is None else position - scale(t, over(self.velocity, position))
 
+    def _height(self, t: ArrayLike, position: Array, normal: Array) -> Array:
+        """How far positions are above the plane through the surface's point [m].
+
+        Only the velocity along the normal moves a plane: a belt, which moves along itself, is where it was at any time.
+        """
+        height = dot(position - over(self.point, position), normal)
+        if self.velocity is None:
+            return height
+        velocity, normal = jnp.broadcast_arrays(self.velocity, unit(self.normal))
+        along = dot(velocity, normal)
+        # what rounding of velocity and normal may be is the zero that it means
+        rounding = 4 * float(jnp.finfo(along.dtype).eps) * dot(jnp.abs(velocity), jnp.abs(normal))
+        along = along - lax.stop_gradient(jnp.where(jnp.abs(along) <= rounding, along, 0.0))
+        return height - t * along
+
 
 ABOUT = ("restitution", "friction", "coulomb", "velocity")
 """What a part of a surface takes over from the whole."""
@@ -170,7 +185,7 @@ class Plane(Surface):
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """(X - P)·N [m]."""
-        return dot(self._still(t, position) - over(self.point, position), self.outward(t, position))
+        return self._height(t, position, self.outward(t, position))
 
     def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """N, of length 1."""
@@ -197,12 +212,12 @@ class Slab(Surface):
 
     def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearer face [m]."""
-        height = jnp.abs(self._height(t, position))
+        height = jnp.abs(self._above(t, position))
         return self.thickness / 2 - height if self.inside else height - self.thickness / 2
 
     def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """The normal of the nearer face."""
-        side = jnp.where((self._height(t, position) < 0) != self.inside, -1.0, 1.0)
+        side = jnp.where((self._above(t, position) < 0) != self.inside, -1.0, 1.0)
         return scale(side, over(unit(self.normal), position))
 
     def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
@@ -215,12 +230,12 @@ class Slab(Surface):
 
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
         """Where a segment crosses the middle of the slab."""
-        h0, h1 = self._height(t, start), self._height(t, end)
+        h0, h1 = self._above(t, start), self._above(t, end)
         crosses = h0 * h1 < 0
         return () if self.inside else (jnp.where(crosses, h0 / jnp.where(crosses, h0 - h1, 1.0), 0.0),)
 
-    def _height(self, t, position):
-        return dot(self._still(t, position) - over(self.point, position), over(unit(self.normal), position))
+    def _above(self, t, position):
+        return self._height(t, position, over(unit(self.normal), position))
 
 
 class Sphere(Surface):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.lanes import any_lane, wide
+from physjax.loops import Time
 from physjax.particles import demand_particles
 from physjax.scene import as_module
 from physjax.vectors import norm
@@ -52,11 +53,11 @@ class Adaptive(eqx.Module):
     error: str = eqx.field(static=True)
     tries: int | None = eqx.field(static=True)
 
-    def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
 
-    def report(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Steps:
+    def report(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Steps:
         """The state a dt later, with the counts of accepted and rejected steps."""
         shape, kind = getattr(system, "status_shape", ()), jax.tree.leaves(state)[0].dtype
         dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
