@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from physjax.checks import quantity
 from physjax.closures import warn_of_remade
 from physjax.lanes import any_lane, wide
-from physjax.loops import repeat, time_at
+from physjax.loops import Moment, moment_at, now, repeat
 from physjax.particles import demand_particles
 from physjax.roots import first_root
 from physjax.scene import as_module
@@ -113,15 +113,15 @@ class _Replay(NamedTuple):
     def held(self) -> "_Replay":
         """The same without derivatives."""
         moving = self.at(jnp.zeros(self.dt.shape, jnp.int32))
-        step = _constant(self.step, moving, self.dt, self.dt)
+        step = _constant(self.step, moving, self.moment(jnp.zeros(self.dt.shape, jnp.int32), 0), self.dt)
         gap = _constant(self.gap, self.dt, moving.state.position)
         return _Replay(
             lax.stop_gradient(self.frames), step, gap, self.first_step, self.every, lax.stop_gradient(self.dt)
         )
 
-    def time(self, frame: Array, i: ArrayLike) -> Array:
-        """When the step begins that comes i steps after a frame [s]."""
-        return time_at(self.first_step + frame * self.every + i, self.dt, self.dt.dtype)
+    def moment(self, frame: Array, i: ArrayLike) -> Moment:
+        """When the step begins that comes i steps after a frame."""
+        return moment_at(self.first_step + frame * self.every + i, self.dt, self.dt.dtype)
 
     def at(self, frame: Array) -> Any:
         """What changes, as it was at a frame of its own for each lane."""
@@ -141,16 +141,16 @@ def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossi
     moving = replay.at(place.frame)
 
     def forward(i, moving):
-        after = replay.step(moving, replay.time(place.frame, i), replay.dt)
+        after = replay.step(moving, replay.moment(place.frame, i), replay.dt)
         return jax.tree.map(lambda a, b: jnp.where(wide(i < place.step, a), a, b), after, moving)
 
     if replay.every > 1:
         moving = repeat(forward, moving, jnp.zeros((), jnp.int32), replay.every - 1)
-    begun = replay.time(place.frame, place.step)
+    begun = replay.moment(place.frame, place.step)
     side = jnp.where(place.before < 0, -1.0, 1.0).astype(replay.dt.dtype)
 
     def left(duration):
-        return side * replay.gap(begun + duration, replay.step(moving, begun, duration).state.position)
+        return side * replay.gap(now(begun + duration), replay.step(moving, begun, duration).state.position)
 
     numbers, left = _hoisted(left, replay.dt)  # the root moves with all that the path depends on
     tolerance = 4 * float(jnp.finfo(replay.dt.dtype).eps) * replay.dt
@@ -159,7 +159,7 @@ def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossi
     duration = first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
     x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
     told = lambda leaf: jnp.where(wide(place.found, leaf), leaf, jnp.nan)  # noqa: E731
-    return Crossing(told(begun + duration), told(x), told(v), place.found)
+    return Crossing(told(now(begun + duration)), told(x), told(v), place.found)
 
 
 def _replay(run: Any, gap: Callable) -> _Replay:
@@ -203,17 +203,17 @@ def _stepped_through(replay: _Replay, frame: Array, way: Array) -> _Place:
     """The first step after a frame at whose end the gap has another sign than at its start."""
 
     def one(i, carry):
-        moving, now, place = carry
-        t = replay.time(frame, i)
+        moving, before, place = carry
+        t = replay.moment(frame, i)
         moving = replay.step(moving, t, replay.dt)
-        after = replay.signed(t + replay.dt, moving)
-        here = _crosses(now, after, way) & ~place.found
-        new = _Place(frame, jnp.full_like(frame, i), now, after, here)
+        after = replay.signed(now(t + replay.dt), moving)
+        here = _crosses(before, after, way) & ~place.found
+        new = _Place(frame, jnp.full_like(frame, i), before, after, here)
         return moving, after, jax.tree.map(lambda a, b: jnp.where(here, a, b), new, place)
 
     moving = replay.at(frame)
-    now = replay.signed(replay.time(frame, 0), moving)
-    start = (moving, now, _Place(frame, jnp.zeros_like(frame), now, now, jnp.zeros(now.shape, bool)))
+    gap = replay.signed(now(replay.moment(frame, 0)), moving)
+    start = (moving, gap, _Place(frame, jnp.zeros_like(frame), gap, gap, jnp.zeros(gap.shape, bool)))
     return lax.fori_loop(0, replay.every, one, start)[2]
 
 
@@ -221,7 +221,7 @@ def _hopes(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:
     """Between which frames there may be a crossing: where the cubic through them changes its sign, which may be at neither."""
 
     def gap_and_rate(frame, moving):
-        t, one = replay.time(jnp.full(replay.dt.shape, frame), 0), jnp.ones_like(replay.dt)
+        t, one = now(replay.moment(jnp.full(replay.dt.shape, frame), 0)), jnp.ones_like(replay.dt)
         _, rate = jax.jvp(replay.gap, (t, moving.state.position), (one, moving.state.velocity))
         return replay.signed(t, moving), replay.every * replay.dt * rate
 

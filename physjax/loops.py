@@ -5,17 +5,201 @@ from collections.abc import Callable
 from functools import partial, reduce
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Float
+
+LAST_STEP = 2**31 - 1
+"""The highest number that a step can have: steps are counted in 32 bits."""
+NUDGE = 1 / 64
+"""The largest share of a step by which a moment is moved to the end of one."""
 
 
 def time_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Array:
     """Time is counted, t = i dt, never accumulated: accumulation drifts by a rounding error a step."""
     return step.astype(dtype) * dt
+
+
+RECORD = {"record": True}
+"""Metadata of a field that is shaped like the lanes because it is a record of them: a state, its mass, a mask, a time."""
+
+
+class Moment(eqx.Module):
+    """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what is over.
+
+    Differences are taken before they are rounded, so that 5 ms are 5 ms after a day in float32, where the time itself is
+    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene are told `now(moment)`, a float.
+    """
+
+    start: Float[Array, "..."] = eqx.field(metadata=RECORD)
+    rest: Float[Array, "..."] = eqx.field(metadata=RECORD)
+    step: Float[Array, "..."] = eqx.field(metadata=RECORD)
+    elapsed: Float[Array, "..."] | None = eqx.field(default=None, metadata=RECORD)
+
+    @classmethod
+    def of(cls, t: Any, dt: ArrayLike, dtype: np.dtype | None = None) -> "Moment":
+        """A moment as it is; a time given as a float is exact, the start of a step of length dt."""
+        if isinstance(t, Moment):
+            return t
+        t = jnp.asarray(t, dtype)
+        return cls(t, jnp.zeros_like(t), jnp.asarray(dt, t.dtype))
+
+    def __add__(self, h: ArrayLike) -> "Moment":
+        """A time h [s] later."""
+        return Moment(self.start, self.rest, self.step, h if self.elapsed is None else self.elapsed + h)
+
+    def __jax_array__(self) -> Array:
+        """The time as a float."""
+        return now(self)
+
+    def until(self, time: Array, rest: ArrayLike = 0.0) -> Array:
+        """How long it is until a time [s], given as a number and what its rounding left out; negative where it is over."""
+        ahead = self._ahead(time, rest)
+        return ahead if self.elapsed is None else ahead - self.elapsed
+
+    def until_on_grid(self, time: Array, rest: ArrayLike = 0.0) -> Array:
+        """How long it is until a time [s], or until the end of a step that differs from it by no more than rounding."""
+        ahead = self._ahead(time, rest)
+        steps = lax.stop_gradient(ahead / self.step)
+        near = jnp.round(steps)
+        rounding = jnp.minimum(2 * float(jnp.finfo(ahead.dtype).eps) * (1 + jnp.abs(time) / self.step), NUDGE)
+        # moved as a constant, so that derivatives by the time go on
+        move = jnp.where(jnp.abs(steps - near) <= rounding, near * self.step - ahead, 0.0)
+        ahead = ahead + lax.stop_gradient(move)
+        return ahead if self.elapsed is None else ahead - self.elapsed
+
+    def since(self, time: Array, rest: ArrayLike = 0.0) -> tuple[Array, Array]:
+        """How long ago a time [s] was, and what rounding left out of that."""
+        whole, left = exact_sum(rounded(self.start), -time)
+        left = left + (self.rest - rest)
+        return whole, left if self.elapsed is None else left + self.elapsed
+
+    def _ahead(self, time: Array, rest: ArrayLike) -> Array:
+        return (time - rounded(self.start)) + (lax.stop_gradient(rest) - self.rest)
+
+
+Time = ArrayLike | Moment
+"""A time [s] as a float, or as steps count it."""
+
+
+def moment_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Moment:
+    """The start of a step, t = i dt, with what its rounding leaves out."""
+    dt = jnp.asarray(dt, dtype)
+    start, rest = exact_multiple(step, dt)
+    return Moment(start, rest, dt)
+
+
+def now(t: Any) -> Any:
+    """The time as a float, which is what parts of a scene see."""
+    if not isinstance(t, Moment):
+        return t
+    return t.start if t.elapsed is None else t.start + t.elapsed
+
+
+def told(part: Any, t: Any) -> Any:
+    """The time as a part of a scene is told it: the moment itself only if it asks for moments, as those of the library."""
+    return t if getattr(part, "sees_moments", False) is True else now(t)
+
+
+def told_method(method: Any, t: Any) -> Any:
+    """The time as a method is told it, which may have another inside: a user's gets a float."""
+    inner = getattr(method, "method", None)
+    return t if is_ours(method) and (inner is None or is_ours(inner)) else now(t)
+
+
+def at_now(response: Callable, motion: Callable, scene: Any, t: Any, dt: ArrayLike) -> Any:
+    """A user's response, which is told the time as a float."""
+    return response(motion, scene, now(t), dt)
+
+
+def is_ours(part: Any) -> bool:
+    """Whether a function or a module is the library's own, which may be told a moment instead of a float."""
+    return getattr(getattr(part, "function", part), "__module__", "").startswith("physjax.")
+
+
+def rounded(number: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The number as it is, rounded before anything is added to it: no compiler may contract both across this bound."""
+    return jnp.maximum(number, jnp.finfo(number.dtype).min)
+
+
+def exact_sum(a: Array, b: Array) -> tuple[Array, Array]:
+    """a + b, and what rounding left out of it (D. E. Knuth); the derivative is that of the sum."""
+    total = a + b
+    x, y, s = lax.stop_gradient((a, b, rounded(total)))
+    part = s - x
+    return total, (x - (s - part)) + (y - part)
+
+
+def exact_multiple(count: Array, number: Array) -> tuple[Array, Array]:
+    """count·number, and what rounding left out of it, for a count in 32 bits; the derivative is that of the product.
+
+    The parts are so short that their products are exact, in an order in which their sum is.
+    """
+    dtype = number.dtype
+    product = count.astype(dtype) * number
+    low = count & 0xFFFF
+    low, high = low.astype(dtype), (count - low).astype(dtype)
+    a, b, c = _in_three(lax.stop_gradient(number))
+    rest = high * a - rounded(lax.stop_gradient(product))
+    return product, ((((rest + high * b) + low * a) + high * c) + low * b) + low * c
+
+
+def exact_quotient(count: Array, number: Array) -> tuple[Array, Array]:
+    """count/number, and what rounding left out of it, for a count in 32 bits; the derivative is that of the quotient."""
+    whole = count.astype(number.dtype)
+    quotient = whole / number
+    q, d = lax.stop_gradient((quotient, number))
+    low = count & 0xFFFF
+    left = ((count - low).astype(d.dtype) - whole) + low.astype(d.dtype)
+    (qa, qb), (da, db) = _in_two(q), _in_two(d)
+    rest = ((whole - qa * da) - qa * db) - qb * da
+    return quotient, ((rest - qb * db) + left) / d
+
+
+def rest_of(value: Any, known: Any = None) -> Array:
+    """What float32 cannot hold of a number that a user gives, so that a moment far from t = 0 is not moved.
+
+    Nothing where the number is float32 already; then what is `known` of it stays.
+    """
+    if isinstance(value, jax.Array):
+        if value.dtype == np.float64:
+            return (value - value.astype(np.float32).astype(value.dtype)).astype(np.float32)
+        return jnp.zeros(value.shape, np.float32) if known is None else known
+    try:
+        exact = np.asarray(value, np.float64)
+    except (TypeError, ValueError):  # whoever checks the number says what is wrong with it
+        return jnp.zeros((), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        rest = (exact - exact.astype(np.float32)).astype(np.float32)
+    return jnp.asarray(np.where(np.isfinite(rest), rest, 0.0), np.float32)
+
+
+def rest_in(value: Array, rest: Array) -> Array:
+    """The rest of a number as its dtype has it: none where the number holds it already, or is no longer the one it is of."""
+    value, rest = lax.stop_gradient((value, rest.astype(value.dtype)))
+    bare = value.astype(np.float32).astype(value.dtype) == value
+    half = float(jnp.finfo(np.float32).eps) / 2
+    return jnp.where(bare & (jnp.abs(rest) <= half * jnp.abs(value)), rest, 0.0)
+
+
+def _in_three(number: Array) -> tuple[Array, Array, Array]:
+    """A number as the sum of three of a third of its digits."""
+    bits = jnp.finfo(number.dtype)
+    short = partial(lax.reduce_precision, exponent_bits=bits.nexp, mantissa_bits=bits.nmant // 3)
+    first = short(number)
+    second = short(number - first)
+    return first, second, number - first - second
+
+
+def _in_two(number: Array) -> tuple[Array, Array]:
+    """A number as the sum of two of half its digits."""
+    bits = jnp.finfo(number.dtype)
+    first = lax.reduce_precision(number, exponent_bits=bits.nexp, mantissa_bits=bits.nmant // 2)
+    return first, number - first
 
 
 def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import real_array, real_quantity
+from physjax.loops import Time, told
 from physjax.vectors import dot, scale
 
 
@@ -51,15 +52,15 @@ class Particles(NamedTuple):
         """The state and the mass that a force sees."""
         return self, mass
 
-    def load(self, force: Any, t: ArrayLike, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def load(self, force: Any, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """What a force does to each lane [N], shaped like the velocity; seen once, while tracing."""
-        return shaped(force, force(t, self, mass), self.velocity)
+        return shaped(force, force(told(force, t), self, mass), self.velocity)
 
     def total(self, terms: Any) -> Float[Array, "*lanes dim"]:
         """The sum of loads [N]."""
         return added(terms) if terms else jnp.zeros_like(self.velocity)
 
-    def driven(self, scene: Any, t: ArrayLike) -> Float[Array, "*lanes dim"]:
+    def driven(self, scene: Any, t: Time) -> Float[Array, "*lanes dim"]:
         """Acceleration [m/s²]."""
         return scene.acceleration(t, self)
 

@@ -17,8 +17,6 @@ from jaxtyping import Array, Bool
 
 from physjax.checks import OWN_AXES, Quantity, starts_legally
 
-RECORD = {"record": True}
-"""Metadata of a field that is shaped like the lanes because it is a record of them: a state, its mass, a mask."""
 PER_LANE = ("lane", "table", "point")
 """What there may be one of for each lane, given by the user."""
 

@@ -18,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.lanes import WHOLE, kept_apart
+from physjax.loops import RECORD, Time, at_now, is_ours, now, told, told_method
 from physjax.particles import Particles, added, shaped
 from physjax.parts import (
     Contact,
@@ -32,11 +33,11 @@ from physjax.parts import (
     prepared_force,
     under_one_gravity,
 )
-from physjax.quantities import RECORD, demand_fitting_numbers, lane_mask, may_hide_lanes, spoilt
+from physjax.quantities import demand_fitting_numbers, lane_mask, may_hide_lanes, spoilt
 from physjax.vectors import scale
 
 
-def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "Scene":
+def project(motion: Callable, scene: "Scene", t: Time, dt: Time) -> "Scene":
     """The lecture's response: step as if nothing were there, then put back and turn around what went in.
 
     Cheap and robust, first order in dt: a bounce happens at the end of the step, not when the surface was met, and a
@@ -53,7 +54,7 @@ def project(motion: Callable, scene: "Scene", t: ArrayLike, dt: ArrayLike) -> "S
     state = scene.state
     for contact in scene.contacts:
         if (contact.response or project) is project:
-            state = contact.answered(t + dt, state, scene.mass)
+            state = contact.answered(now(t + dt), state, scene.mass)
     return scene.having(state=state)
 
 
@@ -165,13 +166,13 @@ class Scene(eqx.Module):
         """Shape of what is decided once a scene when lanes are coupled, once a lane when not: status and step size."""
         return self.state.lanes[:-1] if self.couples else self.state.lanes
 
-    def acceleration(self, t: ArrayLike, state: Particles) -> Float[Array, "*lanes dim"]:
+    def acceleration(self, t: Time, state: Particles) -> Float[Array, "*lanes dim"]:
         """Newton's second law, a = ΣF/m [m/s²]; held lanes do not accelerate, led ones as their path does."""
         if self.led is not None:
-            state = self.led.lead(t, state)
+            state = self.led.lead(now(t), state)
         free = None if self.held is None else 1 - self.held.astype(state.dtype)
         fields = [f for f in self.forces if isinstance(f, Field)]
-        fields = [shaped(f, f.acceleration(t, state, self.mass), state.velocity) for f in fields]
+        fields = [shaped(f, f.acceleration(told(f, t), state, self.mass), state.velocity) for f in fields]
         newtons = [state.load(f, t, self.mass) for f in self.forces if not isinstance(f, Field)]
         total = []
         if fields:
@@ -180,15 +181,15 @@ class Scene(eqx.Module):
             total.append(scale((1.0 if free is None else free) / self.mass, added(newtons)))
         acceleration = added(total) if total else jnp.zeros_like(state.velocity)
         if self.led is not None:
-            acceleration = self.led.drive(t, state, acceleration)
-        return acceleration if self.reaction is None else self.reaction(t, state, acceleration)
+            acceleration = self.led.drive(now(t), state, acceleration)
+        return acceleration if self.reaction is None else self.reaction(now(t), state, acceleration)
 
-    def rate(self, t: ArrayLike, state: Any) -> Any:
+    def rate(self, t: Time, state: Any) -> Any:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.in_pieces:
             return state.rate(state.driven(self, t), self.mass)
         # apart, or a method's stage would be computed anew in every neighbour that looks at it
-        return state.rate(kept_apart(t, lambda: state.driven(self, t)), self.mass)
+        return state.rate(kept_apart(now(t), lambda: state.driven(self, t)), self.mass)
 
     def kick(self, state: Any, rate: Any, dt: ArrayLike) -> Any:
         """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""
@@ -202,10 +203,10 @@ class Scene(eqx.Module):
         """The state as it must be after a step, where its arrays have to agree with each other."""
         return state.settled(self.mass) if hasattr(state, "settled") else state
 
-    def during(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
+    def during(self, t: Time, dt: ArrayLike) -> "Scene":
         """The scene as one step sees it: forces that jump in time replaced by their mean over the step."""
         see = lambda f: self.state.shown_to(f, self.mass)[0]  # noqa: E731
-        forces = tuple(f.during(t, dt, see(f)) if hasattr(f, "during") else f for f in self.forces)
+        forces = tuple(f.during(told(f, t), dt, see(f)) if hasattr(f, "during") else f for f in self.forces)
         return eqx.tree_at(lambda scene: scene.forces, self, forces)
 
     @property
@@ -214,27 +215,27 @@ class Scene(eqx.Module):
         flat = not hasattr(self.state, "settled")  # what turns pushes back in no symmetric way
         return flat and all(getattr(force, "definite", False) for force in self.forces)
 
-    def near(self, t: ArrayLike, state: Any) -> "Scene":
+    def near(self, t: Time, state: Any) -> "Scene":
         """The scene as an implicit step sees it: forces that have a tangent at this state replaced by it."""
-        state = state if self.led is None else self.led.lead(t, state)
+        state = state if self.led is None else self.led.lead(now(t), state)
         see = lambda f: state.shown_to(f, self.mass)  # noqa: E731
-        return self.having(forces=tuple(f.near(t, *see(f)) if hasattr(f, "near") else f for f in self.forces))
+        return self.having(forces=tuple(f.near(told(f, t), *see(f)) if hasattr(f, "near") else f for f in self.forces))
 
-    def step(self, method: Callable, t: ArrayLike, dt: ArrayLike) -> "Scene":
+    def step(self, method: Callable, t: Time, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
         motion = Partial(free_motion, as_module(method))
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
-            motion = Partial(response, motion)
+            motion = Partial(response, motion) if is_ours(response) else Partial(at_now, as_module(response), motion)
         after = motion(self, t, dt) if self.emitter is None else self.emitter.live(motion, self, t, dt)
         state = after.state
         if self.led is not None:
-            state = self.led.lead(t + dt, state)
+            state = self.led.lead(now(t + dt), state)
         elif self.contacts and self.pinned is not None:
             held = self.pinned[..., None]
             state = jax.tree.map(lambda now, before: jnp.where(held, before, now), state, self.state)
-        return after.having(state=state).advanced(t, dt)
+        return after.having(state=state).advanced(now(t), dt)
 
     def advanced(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene after each force that remembers has advanced by a step from t to t + dt."""
@@ -264,19 +265,19 @@ def traced_once(response: Callable) -> Callable:
     program = jax.jit(response)
 
     @wraps(response)
-    def respond(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+    def respond(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
         return program(motion if isinstance(motion, Partial) else Partial(motion), scene, t, dt)
 
     return respond
 
 
-def free_motion(method: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+def free_motion(method: Callable, scene: Scene, t: Time, dt: Time) -> Scene:
     """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
     seen = method.checked(scene) if hasattr(method, "checked") else scene.during(t, dt)
-    return scene.having(state=scene.settled(method(seen, t, scene.state, dt)))
+    return scene.having(state=scene.settled(method(seen, told_method(method, t), scene.state, dt)))
 
 
-def loads(scene: Scene, t: ArrayLike, state: Any = None, *, per_term: bool = False) -> Any:
+def loads(scene: Scene, t: Time, state: Any = None, *, per_term: bool = False) -> Any:
     """Total force on each lane [N] (the lecture's ComputeTotalForce), at `scene.state` unless a state is given.
 
     Returns an array shaped like the velocity, for rigid bodies a `Wrench` of force [N] and torque about the centre of

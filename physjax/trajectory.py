@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from physjax.checks import concrete
 from physjax.crossing import Crossing, first_crossing
 from physjax.files import RUN_FORMAT, demand_run, read_arrays, replacing
+from physjax.loops import moment_at
 from physjax.scene import Contact, Function, Particles, Scene, as_module, changes
 
 
@@ -221,7 +222,7 @@ class Trajectory(eqx.Module):
 def _first_bad_step(scene, method, dt, first_step, steps):
     def body(carry):
         i, scene, found = carry
-        scene = scene.step(method, (first_step + i).astype(scene.state.dtype) * dt, dt)
+        scene = scene.step(method, moment_at(first_step + i, dt, scene.state.dtype), dt)
         fresh = (found < 0) & ~scene.finite(scene.state)
         return i + 1, scene, jnp.where(fresh, first_step + i + 1, found)
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from physjax.checks import real_array, real_quantity
 from physjax.lanes import kept_apart
+from physjax.loops import Time, told
 from physjax.particles import Particles, added, shaped
 from physjax.physics.inertia import Inertia, real_turn
 from physjax.scene import Force, Function, loads
@@ -59,7 +60,7 @@ class Load(Force):
     def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
         """Force [N] and torque about the centre of mass [N m] on each body."""
 
-    def __call__(self, t: ArrayLike, state: Any, mass: Any) -> Wrench:
+    def __call__(self, t: Time, state: Any, mass: Any) -> Wrench:
         """The wrench; a TypeError where there are no bodies."""
         if not isinstance(state, RigidBodies):
             raise TypeError(
@@ -124,9 +125,9 @@ class RigidBodies(NamedTuple):
             return self, mass
         return Particles(self.position, scale(1 / mass.mass, self.momentum)), mass.mass
 
-    def load(self, force: Any, t: ArrayLike, mass: Inertia) -> Wrench:
+    def load(self, force: Any, t: Time, mass: Inertia) -> Wrench:
         """What a force does to each body: a wrench, or a force at the centre of mass."""
-        found = force(t, *self.shown_to(force, mass))
+        found = force(told(force, t), *self.shown_to(force, mass))
         found = found if isinstance(found, Wrench) else Wrench(found)
         return Wrench(*(None if part is None else shaped(force, part, self.position) for part in found))
 
@@ -136,7 +137,7 @@ class RigidBodies(NamedTuple):
         present = ([part for part in parts if part is not None] for parts in kinds)
         return Wrench(*(added(parts) if parts else jnp.zeros_like(self.position) for parts in present))
 
-    def driven(self, scene: Any, t: ArrayLike) -> Wrench:
+    def driven(self, scene: Any, t: Time) -> Wrench:
         """Total force and torque; none on bodies that are held."""
         total = loads(scene, t, self.on_pivot(scene.mass))
         if scene.held is None:

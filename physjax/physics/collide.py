@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.lanes import any_lane, apart
+from physjax.loops import Time, now
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_acceleration, angular_velocity
 from physjax.physics.impact import (
@@ -63,7 +64,7 @@ class _Leg(NamedTuple):
 
 
 @traced_once
-def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+def collide(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The response of rigid bodies: from impact to impact, at most 8 a body and step, and held in between.
 
     A body that would have more impacts in a step waits where it is, with its velocity, for the next; where a moving
@@ -87,7 +88,7 @@ def collide(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scen
     return scene.having(state=_waited(scene, leg, t, dt))
 
 
-def collisions(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Callable, total: Any) -> Any:
+def collisions(motion: Callable, scene: Scene, t: Time, dt: ArrayLike, add: Callable, total: Any) -> Any:
     """The legs of the step that `collide` takes, told one by one as by `impact.flights`: what held the bodies is in them.
 
     Each begins with half of what the surfaces give through it; `after` is what the other half and the impact made of its
@@ -103,7 +104,8 @@ def collisions(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add:
     if scene.couples:
         thrust = _thrust(_facing(scene, t), _on_now(_facing(scene, t), t, dt), t, dt)
         after = _answered_at_the_end(motion, scene, t, dt)
-        return add(total, flown(scene, thrust, jnp.broadcast_to(t, dt.shape), dt, after, None)), after
+        begun = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, dt.shape), t)
+        return add(total, flown(scene, thrust, begun, dt, after, None)), after
 
     def fly(leg, total):
         begun, rest = _left(leg, t, dt)
@@ -128,17 +130,17 @@ def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
     return _Leg(jnp.zeros_like(dt), scene.state, arrived), dt
 
 
-def _left(leg: _Leg, t: ArrayLike, dt: Array) -> tuple[Array, Array]:
+def _left(leg: _Leg, t: Time, dt: Array) -> tuple[Time, Array]:
     """When a leg begins, and how much of the step is left."""
     return t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
 
 
-def _own(scene: Scene, number: Array) -> Array:
+def _own(scene: Scene, number: Any) -> Any:
     """A number of each body; coupled ones share theirs, and a method that chooses its own steps may ask."""
-    return number[..., 0] if scene.couples else number
+    return jax.tree.map(lambda leaf: leaf[..., 0], number) if scene.couples else number
 
 
-def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> _Leg:
+def _leg(motion: Callable, scene: Scene, leg: _Leg, t: Time, dt: Array) -> _Leg:
     """From where the bodies are to the first impact of each, or to the end of the step."""
     (begun, rest), going = _left(leg, t, dt), ~leg.arrived
     here = _facing(scene.having(state=leg.state), begun)
@@ -161,18 +163,18 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> 
     return lax.cond(any_lane(hit), touch, lambda: through)
 
 
-def _waited(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> RigidBodies:
+def _waited(scene: Scene, leg: _Leg, t: Time, dt: Array) -> RigidBodies:
     """The bodies after a step; those that waited in it where a surface has moved over them are not finite any more."""
 
     def lost():
         begun = t + leg.elapsed
         seen = _facing(scene.having(state=leg.state), begun)
-        return ~leg.arrived & passed_over(_touches(seen), begun, t + dt, leg.state)
+        return ~leg.arrived & passed_over(_touches(seen), now(begun), now(t + dt), leg.state)
 
     return without(apart(~leg.arrived, lost), leg.state)
 
 
-def _answered_at_the_end(motion: Callable, scene: Scene, t: ArrayLike, dt: Array) -> RigidBodies:
+def _answered_at_the_end(motion: Callable, scene: Scene, t: Time, dt: Array) -> RigidBodies:
     """The whole step held by what touches from its start; impacts answered at its end, and what went in moved out."""
     scene = _facing(scene, t)
     kick, on = _kick(scene, t, dt), _on_now(scene, t, dt)
@@ -180,13 +182,13 @@ def _answered_at_the_end(motion: Callable, scene: Scene, t: ArrayLike, dt: Array
     end = apart(on, lambda: _landed(scene, end, on, kick, t + dt), end)
     struck = _struck(scene, end, jnp.ones(dt.shape, bool), kick, t + dt, dt)
     for contact in _touches(scene):
-        struck = contact.respond(t + dt, struck)
+        struck = contact.respond(now(t + dt), struck)
     if not any(contact.narrow for contact in _touches(scene)):
         return struck
     return without(_passed_through(scene, on, end, t, dt), struck)
 
 
-def _passed_through(scene: Scene, on: Array, end: RigidBodies, t: ArrayLike, dt: Array) -> Array:
+def _passed_through(scene: Scene, on: Array, end: RigidBodies, t: Time, dt: Array) -> Array:
     """Which bodies have a point that went deep through an obstacle and out again within a step, unseen at its end."""
     start, end = lax.stop_gradient((felt_by(scene, t, scene.state), felt_by(scene, t + dt, end)))
     dip = _dips(scene, on, start, end, t, dt)
@@ -199,25 +201,25 @@ def _touches(scene: Scene) -> list:
     return [contact for contact in scene.contacts if contact.response is collide]
 
 
-def _facing(scene: Scene, t: ArrayLike) -> Scene:
+def _facing(scene: Scene, t: Time) -> Scene:
     """The scene with surfaces as its bodies see them from where they are: rooms taken apart, of a slab the nearer face."""
     seen = [
-        wall.facing(t, scene.state) if contact.response is collide else wall
+        wall.facing(now(t), scene.state) if contact.response is collide else wall
         for contact in scene.contacts
         for wall in (contact.walls() if contact.response is collide else (contact,))
     ]
     return scene.having(contacts=tuple(seen))
 
 
-def _kick(scene: Scene, t: ArrayLike, dt: Array) -> Array:
+def _kick(scene: Scene, t: Time, dt: Array) -> Array:
     """The velocity that the loads give in a step [m/s]: what the smallness of speeds and gaps is measured by."""
     force, _ = scene.state.driven(scene, t)
     return lax.stop_gradient(dt * norm(force) / scene.mass.mass)
 
 
-def felt_by(scene: Scene, t: ArrayLike, state: RigidBodies) -> Felt:
+def felt_by(scene: Scene, t: Time, state: RigidBodies) -> Felt:
     """Every point of every hull, as its surface feels it."""
-    parts = [contact.felt(t, state, scene.mass) for contact in _touches(scene)]
+    parts = [contact.felt(now(t), state, scene.mass) for contact in _touches(scene)]
     if len(parts) > 1 and any(part.turning is not None for part in parts):
         flat = lambda part: (jnp.zeros_like(part.points.normal), jnp.zeros_like(part.gap))  # noqa: E731
         parts = [part._replace(turning=part.turning or flat(part)) for part in parts]
@@ -242,13 +244,13 @@ def _on(felt: Felt, state: RigidBodies, kick: Array, dt: Array) -> Array:
     return _near(felt, state, kick, dt) & (speed <= SLOW * kick[None] + rounding)
 
 
-def _on_now(scene: Scene, t: ArrayLike, dt: Array) -> Array:
+def _on_now(scene: Scene, t: Time, dt: Array) -> Array:
     """Which points touch and stay, at the scene's own state."""
     felt = lax.stop_gradient(felt_by(scene, t, scene.state))
     return _on(felt, scene.state, _kick(scene, t, dt), dt)
 
 
-def _thrust(scene: Scene, on: Array, t: ArrayLike, h: Array) -> tuple[Array, Array]:
+def _thrust(scene: Scene, on: Array, t: Time, h: Array) -> tuple[Array, Array]:
     """Force and torque of the reactions over a coming time h, of which the start gives h/2."""
 
     def pressed():
@@ -259,7 +261,7 @@ def _thrust(scene: Scene, on: Array, t: ArrayLike, h: Array) -> tuple[Array, Arr
     return apart(on, pressed)
 
 
-def _carried(motion: Callable, scene: Scene, thrust: tuple[Array, Array], t: ArrayLike, h: Array) -> RigidBodies:
+def _carried(motion: Callable, scene: Scene, thrust: tuple[Array, Array], t: Time, h: Array) -> RigidBodies:
     """The motion for a time h that begins with half of the reactions' impulse."""
     return motion(scene.having(state=_pushed(scene.state, thrust, h)), t, _own(scene, h)).state
 
@@ -270,7 +272,7 @@ def _pushed(state: RigidBodies, thrust: tuple[Array, Array], h: Array) -> RigidB
     return RigidBodies(x, q, p + scale(h / 2, thrust[0]), spin + scale(h / 2, thrust[1]))
 
 
-def _landed(scene: Scene, end: RigidBodies, on: Array, kick: Array, t: ArrayLike) -> RigidBodies:
+def _landed(scene: Scene, end: RigidBodies, on: Array, kick: Array, t: Time) -> RigidBodies:
     """The bodies after the other half, on what carries them; those at rest keep the place they had."""
     held, push = _pressed(scene, end, on, t, jnp.zeros_like(kick))
     held = _put_back(held, felt_by(scene, t, held), on & (push > 0))
@@ -280,7 +282,7 @@ def _landed(scene: Scene, end: RigidBodies, on: Array, kick: Array, t: ArrayLike
     return chosen(some & rests, still, chosen(some, held, end))
 
 
-def _pressed(scene: Scene, state: RigidBodies, on: Array, t: ArrayLike, ahead: Array) -> tuple[RigidBodies, Array]:
+def _pressed(scene: Scene, state: RigidBodies, on: Array, t: Time, ahead: Array) -> tuple[RigidBodies, Array]:
     """The impulses that keep the points from going in, as their velocities will be a time `ahead` if nothing does."""
     felt, mass = felt_by(scene, t, state), scene.mass
     points = felt.points
@@ -308,20 +310,20 @@ def _put_back(state: RigidBodies, felt: Felt, pressed: Array) -> RigidBodies:
     return state._replace(position=state.position - jnp.sum(scale(share, felt.points.normal), axis=0))
 
 
-def _dips(scene: Scene, on: Array, start: Felt, end: Felt, t: ArrayLike, dt: Array) -> Dip:
+def _dips(scene: Scene, on: Array, start: Felt, end: Felt, t: Time, dt: Array) -> Dip:
     """Which points meet their surface within a leg, and between which shares of it, as the cubics of their gaps have it."""
     parts, first = [], 0
     for contact in _touches(scene):
         some = slice(first, first := first + contact.hull.points.shape[-2])
         lanes = start.gap[some].shape
-        wide = [jnp.broadcast_to(number, lanes) for number in (t, dt)]
+        wide = [jnp.broadcast_to(number, lanes) for number in (now(t), dt)]
         ends = [jax.tree.map(lambda leaf, some=some: leaf[some], felt.center) for felt in (start, end)]
         parts.append(dip_of(contact, *wide, *ends))
     dip = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return dip._replace(last=jnp.where(on, jnp.inf, dip.last))
 
 
-def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun: Array, rest: Array) -> Array:
+def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun: Time, rest: Array) -> Array:
     """When the first point reaches its surface on the method's own path [s after `begun`]; differentiable.
 
     Every point is looked at that nothing holds: one that turns fast may go in where its cubic has not foreseen it.
@@ -343,7 +345,7 @@ def _moment(motion: Callable, scene: Scene, watched: tuple, thrust: tuple, begun
     return first_root(lowest, (scene, thrust, on, begun), (bracket, (above, below), hit, tolerance))
 
 
-def _struck(scene: Scene, state: RigidBodies, hit: Array, kick: Array, t: ArrayLike, dt: Array) -> RigidBodies:
+def _struck(scene: Scene, state: RigidBodies, hit: Array, kick: Array, t: Time, dt: Array) -> RigidBodies:
     """The bodies that are hit after the impact of all their points that touch."""
     felt = felt_by(scene, t, state)
     active = lax.stop_gradient(_near(felt, state, kick, dt)) & hit[None]

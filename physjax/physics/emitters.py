@@ -17,10 +17,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from physjax.checks import concrete, declared, demand, demand_direction, positive_integer, quantity
-from physjax.lanes import on_runs
+from physjax.lanes import kept_apart, on_runs
+from physjax.loops import NUDGE, Moment, Time, exact_multiple, exact_quotient, exact_sum, now, rest_in, rest_of, rounded
 from physjax.particles import Particles, demand_particles
 from physjax.physics.looks import Appearance, Look
-from physjax.physics.sources import Box, Disc, Mesh, Point, Source, Sphere, direction_of, in_cone, rounded
+from physjax.physics.sources import Box, Disc, Mesh, Point, Source, Sphere, direction_of, in_cone
 from physjax.vectors import components, over, scale, stacked
 
 _DRAWS = 8
@@ -55,7 +56,8 @@ class Emitter(eqx.Module):
 
     Every number but the counts can be swept and differentiated (births at fixed generations). A slot that is needed
     again before its particle has died is an error that names the pool needed; with `drop_oldest` the oldest makes way.
-    Time is that of the state's type: float32 counts 16 million births, and tells births apart while rate·eps·t < 1.
+    Moments are counted, and kept with what rounding to the state's type leaves out of them, so that a day later births
+    still come one by one; after 2³¹ births the particles are not a number any more.
     Raises ValueError or TypeError for numbers out of range.
 
     Example:
@@ -64,7 +66,7 @@ class Emitter(eqx.Module):
         [0.   0.25 2.5 ]
     """
 
-    memory: ClassVar[tuple[str, ...]] = ("generation", "born", "dies")
+    memory: ClassVar[tuple[str, ...]] = ("generation", "born", "born_rest", "dies", "dies_rest")
 
     pool: int = eqx.field(static=True, converter=lambda value: positive_integer("pool", value))
     source: Source
@@ -94,10 +96,20 @@ class Emitter(eqx.Module):
     generation: Int[Array, "..."] | None = declared("generation", per="memory", default=None, kw_only=True)
     born: Float[Array, "..."] | None = declared("birth", "s", per="memory", default=None, kw_only=True)
     dies: Float[Array, "..."] | None = declared("death", "s", per="memory", default=None, kw_only=True)
+    start_rest: Float[Array, "..."] | None = declared(
+        "rest of the start", "s", per=None, default=None, repr=False, kw_only=True
+    )
+    born_rest: Float[Array, "..."] | None = declared(
+        "rest of birth", "s", per="memory", default=None, repr=False, kw_only=True
+    )
+    dies_rest: Float[Array, "..."] | None = declared(
+        "rest of death", "s", per="memory", default=None, repr=False, kw_only=True
+    )
 
     def __post_init__(self):
         # an array of its own, so that lanes that are taken apart keep their numbers
         self.slot = jnp.arange(self.pool, dtype=jnp.int32)
+        self.start_rest = rest_of(self.start, self.start_rest)
 
     def __check_init__(self):
         if self.rate is not None and (self.every is not None or self.burst is not None):
@@ -149,23 +161,50 @@ class Emitter(eqx.Module):
 
     def birth_time(self, slot: Int[Array, "*births"], generation: Int[Array, "*births"]) -> Float[Array, "*births"]:
         """When the particle of a slot and generation is born [s]: start + n/rate, or its burst's moment."""
-        if self._pace is None:
-            return jnp.broadcast_to(self.start, generation.shape)
-        before = (slot // self._burst * self._burst).astype(self.start.dtype)
-        return self.start + (generation.astype(self.start.dtype) * self.pool + before) / self._pace
+        return self._birth_moment(slot, generation)[0]
 
-    def due(self, t: ArrayLike) -> Int[Array, "pool"]:
-        """The generation that each slot has been born in by a time [s]; -1 where it has not been born."""
-        since = jnp.asarray(t, self.start.dtype) - self.start
+    def _birth_moment(self, slot: Array, generation: Array) -> tuple[Array, Array]:
+        """When the particle of a slot and generation is born [s], and what rounding left out of that."""
+        start, start_rest = self.start, rest_in(self.start, self.start_rest)
         if self._pace is None:
-            bursts = jnp.where(since < 0, -1.0, 0.0).astype(since.dtype)
-        else:
-            bursts = jnp.maximum(jnp.floor(since * (self._pace / self._burst)), -1.0)
+            return jnp.broadcast_to(start, generation.shape), jnp.broadcast_to(start_rest, generation.shape)
+        after, after_rest = self._after((generation * self.pool + slot) // self._burst)
+        time, rest = exact_sum(start, after)
+        return time, rest + (start_rest + after_rest)
+
+    def _after(self, burst: Array) -> tuple[Array, Array]:
+        """How long after the first a burst comes [s], and what rounding left out of that."""
+        return exact_quotient(burst, self.rate) if self.every is None else exact_multiple(burst, self.every)
+
+    def due(self, t: Time) -> Int[Array, "pool"]:
+        """The generation that each slot has been born in by a time [s]; -1 where it has not been born."""
+        bursts = self._bursts(Moment.of(t, jnp.inf, self.start.dtype))
         last = (bursts + 1) * self._burst - 1
-        # half a birth more, so that no rounding of the quotient falls short of a whole number
-        rounds = jnp.floor((last + 0.5) / self.pool)
-        begun = self.slot <= (last - rounds * self.pool).astype(jnp.int32)
-        return rounds.astype(jnp.int32) + begun.astype(jnp.int32) - 1
+        rounds = last // self.pool
+        begun = self.slot <= last - rounds * self.pool
+        return rounds + begun.astype(jnp.int32) - 1
+
+    @property
+    def _most(self) -> int:
+        """The number of the last burst whose births can be counted in 32 bits."""
+        return (2**31 - 2 * self.pool) // self._burst - 1
+
+    def _bursts(self, t: Moment) -> Array:
+        """The number of the last burst by a time, -1 before the first; one that comes later by no more than rounding is it."""
+        # kept apart, or XLA on CPU would count anew for every lane
+        return kept_apart(now(t), lambda: self._counted_bursts(t))
+
+    def _counted_bursts(self, t: Moment) -> Array:
+        whole, rest = t.since(self.start, rest_in(self.start, self.start_rest))
+        early = jnp.minimum(2 * float(jnp.finfo(whole.dtype).eps) * jnp.abs(t.start), NUDGE * t.step)
+        rest = rest + early
+        if self._pace is None:
+            return jnp.where(whole + rest < 0, -1, 0).astype(jnp.int32)
+        pace = self._pace / self._burst
+        guess = jnp.clip(jnp.floor(whole * pace), -1, self._most).astype(jnp.int32)
+        after, after_rest = self._after(guess)
+        more = jnp.floor(((whole - rounded(after)) + (rest - after_rest)) * pace)
+        return jnp.clip(guess + jnp.clip(more, -1e6, 1e6).astype(jnp.int32), -1, self._most)
 
     @eqx.filter_jit  # as one program wherever it is called: one operation after the other would round otherwise
     def births(self, slot: Int[Array, "births"], generation: Int[Array, "births"]) -> Birth:
@@ -219,28 +258,31 @@ class Emitter(eqx.Module):
             )
         if scene.pinned is not None:
             raise ValueError("emitter: got pinned= as well, expected one of them: who is not alive is held already.")
-        never = jnp.full(self.pool, jnp.inf, state.dtype)
-        return self._cast(state.dtype)._remembering(jnp.full(self.pool, -1, jnp.int32), never, -never)
+        never, nothing = jnp.full(self.pool, jnp.inf, state.dtype), jnp.zeros(self.pool, state.dtype)
+        unborn = jnp.full(self.pool, -1, jnp.int32)
+        return self._cast(state.dtype)._remembering(unborn, never, nothing, -never, nothing)
 
-    def live(self, motion: Callable, scene: Any, t: ArrayLike, dt: ArrayLike) -> Any:
+    def live(self, motion: Callable, scene: Any, t: Time, dt: ArrayLike) -> Any:
         """One step of a scene in which particles are born and die inside it, each at its own moment.
 
         Each lane has its own clock: it runs from birth, if that is in the step, and to death. For who does not live the
         step is so short that nothing moves: a choice between vectors would cost several times the step.
         """
+        t = Moment.of(t, dt, scene.state.dtype)
         emitter, state = self.emit(t + dt, scene.state)
-        born, dies, ends = emitter.born, emitter.dies, t + dt
-        begun, end = jnp.minimum(jnp.maximum(born, t), ends), jnp.minimum(dies, ends)
+        if self._pace is not None:
+            dt = jnp.where(self._bursts(t + dt) < self._most, dt, jnp.nan)
+        born, dies = t.until(emitter.born, emitter.born_rest), t.until(emitter.dies, emitter.dies_rest)
+        begun, end = jnp.clip(born, 0.0, dt), jnp.minimum(dies, dt)
         limits = jnp.finfo(state.dtype)
         shortest = float(limits.tiny) / float(limits.eps)
-        # the step itself, not t + dt - t, which differs by rounding
-        lasts = jnp.where((born <= t) & (dies >= ends), dt, jnp.maximum(end - begun, shortest))
+        lasts = jnp.where((born <= 0) & (dies >= dt), dt, jnp.maximum(end - begun, shortest))
         # the dead keep what they touched: who lies on a surface is not asked again whether it meets it
         contacts = tuple(contact.forgetting(emitter.generation > self.generation) for contact in scene.contacts)
-        after = motion(scene.having(state=state, contacts=contacts, emitter=emitter), begun, lasts)
-        return after.having(state=after.state.held((ends < dies).astype(state.dtype)))
+        after = motion(scene.having(state=state, contacts=contacts, emitter=emitter), t + begun, lasts)
+        return after.having(state=after.state.held((dt < dies).astype(state.dtype)))
 
-    def emit(self, t: ArrayLike, state: Particles) -> tuple["Emitter", Particles]:
+    def emit(self, t: Time, state: Particles) -> tuple["Emitter", Particles]:
         """All that are born by the time t [s], put where they were born; only their numbers are drawn."""
         due = jnp.maximum(self.due(t), self.generation)
 
@@ -248,13 +290,15 @@ class Emitter(eqx.Module):
             return due > changing[1]
 
         def bear(changing, slot, due):
-            (x, v), generation, born, dies = changing
+            (x, v), generation, *moments = changing
             new, birth = due > generation, self.births(slot, due)
             state = Particles(_chosen(new, birth.position, x), _chosen(new, birth.velocity, v))
-            ends = birth.time + birth.life
-            return state, due, jnp.where(new, birth.time, born), jnp.where(new, ends, dies)
+            time, rest = self._birth_moment(slot, due)
+            ends, more = exact_sum(time, birth.life)
+            fresh = (time, rest, ends, rest + more)
+            return state, due, *(jnp.where(new, a, b) for a, b in zip(fresh, moments, strict=True))
 
-        changing = (state, self.generation, self.born, self.dies)
+        changing = (state, *(getattr(self, name) for name in self.memory))
         state, *memory = on_runs(bear, newborn, changing, self.slot, due)
         return self._remembering(*memory), state
 
@@ -278,9 +322,9 @@ class Emitter(eqx.Module):
         life = jnp.where(self.generation < 0, 1.0, self.dies - self.born)
         return self.look.seen(self.alive(t), size, self.age(t) / life)
 
-    def _remembering(self, generation: Array, born: Array, dies: Array) -> "Emitter":
-        where = lambda emitter: (emitter.generation, emitter.born, emitter.dies)  # noqa: E731
-        return eqx.tree_at(where, self, (generation, born, dies), is_leaf=lambda leaf: leaf is None)
+    def _remembering(self, *memory: Array) -> "Emitter":
+        where = lambda emitter: [getattr(emitter, name) for name in emitter.memory]  # noqa: E731
+        return eqx.tree_at(where, self, list(memory), is_leaf=lambda leaf: leaf is None)
 
     def _cast(self, dtype: Any) -> "Emitter":
         return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, self)

@@ -13,8 +13,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import declared, quantity
+from physjax.loops import Time, rest_of
 from physjax.physics.gravitation import Gravitation
-from physjax.physics.timed import Constant, Control, Kick, per_lane, share_before
+from physjax.physics.timed import Constant, Control, Kick, lasts_at, share_within
 from physjax.physics.weight import Buoyancy, Gravity
 from physjax.scene import Field, Force, Function, Particles, loads
 from physjax.vectors import dot, norm, over, scale, spin, unit
@@ -51,28 +52,31 @@ class Blast(Force):
         [0. 4.]
     """
 
+    sees_moments: ClassVar[bool] = True
     center: Float[Array, "..."] = quantity("center of the blast", "m", kind="place")
     impulse: Float[Array, "..."] = quantity("impulse", "N s")
     reach: Float[Array, "..."] = quantity("reach of the blast", "m", above=0)
     at: Float[Array, "..."] = quantity("start of the blast", "s")
     duration: Float[Array, "..."] = quantity("duration of the blast", "s", above=0)
+    at_rest: Float[Array, "..."] | None = declared(
+        "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
+    )
 
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def __post_init__(self):
+        self.at_rest = rest_of(self.at, self.at_rest)
+
+    def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """J/(1 + (d/r)²)/duration away from the center while the blast lasts [N]."""
-        t = per_lane(t, state)
-        lasts = (self.at <= t) & (t < self.at + self.duration)
-        return scale(jnp.where(lasts, 1 / self.duration, 0.0), self.received(state))
+        return scale(jnp.where(lasts_at(self, t, state), 1 / self.duration, 0.0), self.received(state))
 
     def received(self, state: Particles) -> Float[Array, "*lanes dim"]:
         """The impulse that each lane gets if it stays where it is [N s]."""
         d = state.position - over(self.center, state.position)
         return scale(self.impulse / (1 + dot(d, d) / self.reach**2), unit(d))
 
-    def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> "_SteadyBlast":
+    def during(self, t: Time, dt: Time, state: Particles) -> "_SteadyBlast":
         """The mean in time of the force over the step from t to t + dt."""
-        t, dt = per_lane(t, state), per_lane(dt, state)
-        share = share_before(self.at + self.duration, t, dt) - share_before(self.at, t, dt)
-        return _SteadyBlast(self, share / self.duration)
+        return _SteadyBlast(self, share_within(self, t, dt, state) / self.duration)
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
         """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole blast."""

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.lanes import any_lane, apart, loop
+from physjax.loops import Time, now
 from physjax.scene import Particles, Scene
 from physjax.vectors import components, dot, scale, stacked, turn_left, unit
 
@@ -104,11 +105,11 @@ class Held(NamedTuple):
     still: Array
 
 
-def hold(scene: Scene, surfaces: tuple, since: tuple, t: ArrayLike, dt: ArrayLike) -> Held:
+def hold(scene: Scene, surfaces: tuple, since: tuple, t: Time, dt: ArrayLike) -> Held:
     """What carries each lane through the coming step; `since` [s] is when it began to touch each surface (infinite: never)."""
     flag = jnp.isfinite(jnp.stack(since))
     unheld = lax.stop_gradient(apart(flag, lambda: scene.acceleration(t, scene.state), scene.state.velocity))
-    kick = dot(unheld, unheld) * (dt * dt)
+    t, kick = now(t), dot(unheld, unheld) * (dt * dt)
     touching = [
         jnp.isfinite(moment) & _is_close(surface, scene.state, kick, t, dt)
         for surface, moment in zip(surfaces, since, strict=True)

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
 from physjax.lanes import any_lane, apart, on_flagged
+from physjax.loops import Time, now
 from physjax.physics.holding import Held, carried, hold, nothing_held
 from physjax.physics.rebound import rebound
 from physjax.roots import first_root
@@ -30,7 +31,7 @@ SHORTEST_FLIGHT = 0.25
 
 
 @traced_once
-def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+def impact(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The response that finds when each lane touches within the step, bounces it there, and goes on from there.
 
     For independent lanes. At most 8 touches a lane and step: a lane that would touch yet more often waits where it is,
@@ -56,17 +57,17 @@ def impact(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene
         lambda: _held_step(motion, scene, since, anywhere, t, dt),
         lambda: (motion(scene, t, dt).state, since),
     )
-    meets = _may_meet(scene, since, end, t, dt)
+    meets = _may_meet(scene, since, end, now(t), dt)
     if scene.held is not None:
         meets = meets & ~scene.held
-    others = (meets, scene, jnp.asarray(t), jnp.asarray(dt))
+    others = (meets, scene, t, dt)
     cut, masks = scene.may_be_cut(), scene.lane_mask(others)
     end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), *others, masks=masks, cut=cut)
     return scene.having(state=end, contacts=_remembered(scene.contacts, list(since)))
 
 
 def _held_step(
-    motion: Callable, scene: Scene, since: tuple, anywhere: Array, t: ArrayLike, dt: ArrayLike
+    motion: Callable, scene: Scene, since: tuple, anywhere: Array, t: Time, dt: ArrayLike
 ) -> tuple[Particles, tuple]:
     """A step in which surfaces hold some lanes."""
     walls = _walls(scene)
@@ -95,7 +96,7 @@ class _Leg(NamedTuple):
 
 
 def _through_touches(
-    motion: Callable, changing: tuple[Particles, tuple], meets: Array, scene: Scene, t: ArrayLike, dt: ArrayLike
+    motion: Callable, changing: tuple[Particles, tuple], meets: Array, scene: Scene, t: Time, dt: ArrayLike
 ) -> tuple[Particles, tuple]:
     """The step again, leg by leg from touch to touch, of lanes that may meet something; the others are where they arrived."""
     leg, dt = _beginning(scene, dt)
@@ -110,12 +111,14 @@ def _through_touches(
     return _waited(scene, leg, t, dt), leg.since
 
 
-def _waited(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> Particles:
+def _waited(scene: Scene, leg: _Leg, t: Time, dt: Array) -> Particles:
     """The lanes after a step; those that waited in it where a surface has moved over them are not finite any more."""
 
     def lost():
         begun = t + leg.elapsed
-        return ~leg.arrived & passed_over(_faces(_walls(scene), begun, leg.state), begun, t + dt, leg.state)
+        return ~leg.arrived & passed_over(
+            _faces(_walls(scene), now(begun), leg.state), now(begun), now(t + dt), leg.state
+        )
 
     return without(apart(~leg.arrived, lost), leg.state)
 
@@ -143,7 +146,7 @@ def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
     return _Leg(jnp.zeros_like(dt), scene.state, since, jnp.zeros(dt.shape, bool)), dt
 
 
-def _begun(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> tuple[Array, Array, Held]:
+def _begun(scene: Scene, leg: _Leg, t: Time, dt: Array) -> tuple[Time, Array, Held]:
     """When a leg begins, how much of the step is left, and what carries each lane through it."""
     walls, begun, rest = _walls(scene), t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
     here = scene.having(state=leg.state)
@@ -151,13 +154,13 @@ def _begun(scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> tuple[Array, Arr
     return begun, rest, start
 
 
-def _leg(motion: Callable, scene: Scene, leg: _Leg, t: ArrayLike, dt: Array) -> _Leg:
+def _leg(motion: Callable, scene: Scene, leg: _Leg, t: Time, dt: Array) -> _Leg:
     """From where the lanes are to the first touch of each, or to the end of the step."""
     walls, going = _walls(scene), ~leg.arrived
     begun, rest, start = _begun(scene, leg, t, dt)
     held = carried(scene, walls, start)
     end = apart(going, lambda: motion(held, begun, rest).state, leg.state)
-    meeting = apart(going, lambda: _next_meeting(scene, start, end, begun, rest))
+    meeting = apart(going, lambda: _next_meeting(scene, start, end, now(begun), rest))
     through = _Leg(leg.elapsed + rest, end, start.since, jnp.ones_like(leg.arrived))
 
     def touch():
@@ -182,14 +185,14 @@ class Flight(NamedTuple):
 
     before: Particles
     scene: Scene
-    begun: Array
+    begun: Time
     duration: Array
     end: Particles
     after: Particles
     flying: Bool[Array, "*lanes"]
 
 
-def flights(motion: Callable, scene: Scene, t: ArrayLike, dt: ArrayLike, add: Callable, total: Any) -> Any:
+def flights(motion: Callable, scene: Scene, t: Time, dt: ArrayLike, add: Callable, total: Any) -> Any:
     """The legs of the step that `impact` takes, told one by one: `total = add(total, flight)`, folded over them.
 
     Returns the total and the state after the step.
@@ -217,10 +220,10 @@ def hair(dt: Array) -> Array:
 
 
 def _answer(
-    scene: Scene, start: Held, meeting: "_Meeting", t: Array, at: Particles, dt: Array
+    scene: Scene, start: Held, meeting: "_Meeting", t: Time, at: Particles, dt: Array
 ) -> tuple[Particles, tuple]:
     """State and memory after the touches: a bounce, coming to rest, or the end of a slide."""
-    walls, acceleration = _walls(scene), scene.acceleration(t, at)
+    walls, acceleration, t = _walls(scene), scene.acceleration(t, at), now(t)
     guards = jnp.stack(_guards(walls, start, meeting, t, at))
     which = jnp.argmin(guards, axis=0)
     # a path that only just misses, though the cubic touched, goes on as it was
@@ -329,13 +332,13 @@ def _guards(walls: tuple, start: Held, meeting: _Meeting, t: ArrayLike, state: P
     return [jnp.where(seen, value, jnp.inf) for seen, value in zip(meeting.watched, values, strict=True)]
 
 
-def _moment(motion: Callable, scene: Scene, start: Held, meeting: _Meeting, begun: Array, rest: Array) -> Array:
+def _moment(motion: Callable, scene: Scene, start: Held, meeting: _Meeting, begun: Time, rest: Array) -> Array:
     """When the first guard reaches zero on the method's own path [s after `begun`]; differentiable."""
     meeting, rest = lax.stop_gradient((meeting, rest))
 
     def nearest(duration, scene, start, meeting, begun):
         state = motion(scene, begun, duration).state
-        return jnp.min(jnp.stack(_guards(_walls(scene), start, meeting, begun + duration, state)), axis=0)
+        return jnp.min(jnp.stack(_guards(_walls(scene), start, meeting, now(begun + duration), state)), axis=0)
 
     bracket = (meeting.first * rest, jnp.minimum(meeting.last, 1.0) * rest)
     tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest

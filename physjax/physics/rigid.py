@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import quantity, real_quantity
+from physjax.loops import Time
 from physjax.particles import Particles
 from physjax.physics.balls import Balls
 from physjax.physics.bodies import Load, OnBodies, RigidBodies, Wrench, angular_acceleration, angular_velocity, in_world
@@ -220,6 +221,11 @@ class AtPoint(Load):
         return getattr(self.force, "couples", True)
 
     @property
+    def sees_moments(self) -> bool:
+        """Whether the force asks for the time as a moment."""
+        return getattr(self.force, "sees_moments", False)
+
+    @property
     def discontinuities(self) -> Callable:
         """Times at which the force jumps [s], where it does."""
         return self.force.discontinuities
@@ -241,7 +247,7 @@ class AtPoint(Load):
         energy = self.force.potential
         return lambda t, bodies, inertia: energy(t, self._seen(bodies, inertia), inertia.mass)
 
-    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
         force = self.force(t, self._seen(bodies, inertia), inertia.mass)
         return Wrench(force, cross(in_world(bodies, self.point), force))

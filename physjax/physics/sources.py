@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from physjax.checks import concrete, demand, demand_direction, quantity
+from physjax.loops import rounded
 from physjax.vectors import components, over, scale, stacked, turn_left
 
 
@@ -234,11 +235,6 @@ def around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Flo
     first = stacked([1.0 + rounded(sign * x * x * a), sign * b, -sign * x])
     second = stacked([b, sign + rounded(y * y * a), -y])
     return rounded(scale(jnp.cos(angle), first)) + rounded(scale(jnp.sin(angle), second))
-
-
-def rounded(product: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The product as it is, rounded before anything is added to it: no compiler may contract both across this bound."""
-    return jnp.maximum(product, jnp.finfo(product.dtype).min)
 
 
 def direction_of(vector: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:

@@ -1,13 +1,16 @@
 """Forces that follow the clock: the same at all times, for a while, or as given over time."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import declared, quantity
+from physjax.loops import Moment, Time, now, rest_in, rest_of
 from physjax.scene import Force, Particles
 from physjax.vectors import dot, over, scale
 
@@ -44,20 +47,25 @@ class Kick(Force):
         [12.  0.] [0. 0.]
     """
 
+    sees_moments: ClassVar[bool] = True
     impulse: Float[Array, "..."] = quantity("impulse", "N s", kind="vector")
     at: Float[Array, "..."] = quantity("start of the kick", "s")
     duration: Float[Array, "..."] = quantity("duration of the kick", "s", above=0)
+    at_rest: Float[Array, "..."] | None = declared(
+        "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
+    )
 
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def __post_init__(self):
+        self.at_rest = rest_of(self.at, self.at_rest)
+
+    def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """impulse/duration while the kick lasts [N]."""
-        t = per_lane(t, state)
-        lasts = (self.at <= t) & (t < self.at + self.duration)
-        return scale(jnp.where(lasts, 1 / self.duration, 0.0), over(self.impulse, state.velocity))
+        share = jnp.where(lasts_at(self, t, state), 1 / self.duration, 0.0)
+        return scale(share, over(self.impulse, state.velocity))
 
-    def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> Constant:
+    def during(self, t: Time, dt: ArrayLike, state: Particles) -> Constant:
         """The mean of the force over the step from t to t + dt."""
-        t, dt = per_lane(t, state), per_lane(dt, state)
-        share = share_before(self.at + self.duration, t, dt) - share_before(self.at, t, dt)
+        share = share_within(self, t, dt, state)
         return Constant(scale(share / self.duration, over(self.impulse, state.velocity)))
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
@@ -81,10 +89,17 @@ class Control(Force):
     """
 
     definite: ClassVar[bool] = True
+    sees_moments: ClassVar[bool] = True
     values: Float[Array, "*lanes pieces dim"] = quantity("force over time", "N", kind="vector", per="table")
     duration: Float[Array, "..."] = quantity("duration", "s", above=0)
     at: Float[Array, "..."] = quantity("start", "s", default=0.0)
     linear: bool = eqx.field(static=True, default=False)
+    at_rest: Float[Array, "..."] | None = declared(
+        "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
+    )
+
+    def __post_init__(self):
+        self.at_rest = rest_of(self.at, self.at_rest)
 
     def __check_init__(self):
         least = 1 + self.linear
@@ -94,20 +109,22 @@ class Control(Force):
                 f"with at least {least} of them."
             )
 
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The force at the time t [N]."""
-        t, knots = self._clock(t, state)
+        t, knots = self._clock(now(t), state)
         lasts = (knots[..., 0] <= t) & (t < knots[..., -1])
         if self.linear:
             return scale(lasts.astype(t.dtype), self._between(t, state))
         here = (knots[..., :-1] <= t[..., None]) & (t[..., None] < knots[..., 1:])
         return self._weighed(here.astype(t.dtype), state)
 
-    def during(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> Force:
+    def during(self, t: Time, dt: ArrayLike, state: Particles) -> Force:
         """The mean of the force over the step from t to t + dt; if it is linear, the force itself where the step is in it."""
-        t, knots = self._clock(t, state)
-        dt = jnp.broadcast_to(per_lane(dt, state), t.shape)
-        before = share_before(knots, t[..., None], dt[..., None])
+        t, dt = moment_per_lane(t, dt, state)
+        begins, duration, dt = jnp.broadcast_arrays(
+            t.until_on_grid(self.at, rest_in(self.at, self.at_rest)), self.duration, dt
+        )
+        before = share_before(self._knots(begins, duration), dt[..., None], duration[..., None])
         if self.linear:
             return _Ramp(self, before[..., -1] - before[..., 0])
         return Constant(self._weighed(before[..., 1:] - before[..., :-1], state))
@@ -127,12 +144,13 @@ class Control(Force):
         t, at, duration = jnp.broadcast_arrays(per_lane(t, state), self.at, self.duration)
         return t, self._knots(at, duration)
 
-    def _between(self, t: ArrayLike, state: Particles) -> Array:
+    def _between(self, t: Time, state: Particles) -> Array:
         """The straight line between two values; the first and the last one go on."""
-        t, at, duration = jnp.broadcast_arrays(per_lane(t, state), self.at, self.duration)
+        ahead = moment_per_lane(t, 1.0, state)[0].until(self.at, rest_in(self.at, self.at_rest))
+        ahead, duration = jnp.broadcast_arrays(ahead, self.duration)
         count = self.values.shape[-2]
-        place = jnp.clip((t - at) / duration, 0.0, 1.0) * (count - 1)
-        numbers = jnp.arange(count, dtype=t.dtype).reshape((1,) * t.ndim + (-1,))
+        place = jnp.clip(-ahead / duration, 0.0, 1.0) * (count - 1)
+        numbers = jnp.arange(count, dtype=place.dtype).reshape((1,) * place.ndim + (-1,))
         return self._weighed(jnp.maximum(1 - jnp.abs(place[..., None] - numbers), 0.0), state)
 
     def _weighed(self, weights: Array, state: Particles) -> Array:
@@ -147,10 +165,11 @@ class _Ramp(Force):
     """A linear control as a step sees it that lies in it by a share."""
 
     definite: ClassVar[bool] = True
+    sees_moments: ClassVar[bool] = True
     control: Control
     share: Float[Array, "..."] = declared("share of the step", per="memory")
 
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         return scale(self.share, self.control._between(t, state))
 
 
@@ -160,9 +179,37 @@ def per_lane(number: ArrayLike, state: Particles) -> Array:
     return number.reshape(number.shape + (1,) * (len(state.lanes) - number.ndim)) if number.ndim else number
 
 
-def share_before(edge: Array, t: Array, dt: Array) -> Array:
-    """The share of the step from t to t + dt that lies before a time; exactly 0 or 1 if it is one of the step's ends."""
-    share = (edge - t) / dt
+def moment_per_lane(t: Time, dt: ArrayLike, state: Particles) -> tuple[Moment, Array]:
+    """A time, and how long a step takes from there, so that they meet numbers shaped like the lanes."""
+    t = jax.tree.map(lambda number: per_lane(number, state), Moment.of(t, dt, state.dtype))
+    return t, per_lane(dt, state)
+
+
+def lasts_at(force: Any, t: Time, state: Particles) -> Array:
+    """Whether a force acts that begins `at` a time and has a `duration`."""
+    if isinstance(t, Moment):
+        ahead = moment_per_lane(t, 1.0, state)[0].until_on_grid(force.at, rest_in(force.at, force.at_rest))
+        return (ahead <= 0) & (ahead + force.duration > 0)
+    t = per_lane(t, state)
+    return (force.at <= t) & (t < force.at + force.duration)
+
+
+def share_within(force: Any, t: Time, dt: ArrayLike, state: Particles) -> Array:
+    """The share of the step from t to t + dt in which a force lasts that begins `at` a time and has a `duration`."""
+    t, dt = moment_per_lane(t, dt, state)
+    begins = t.until_on_grid(force.at, rest_in(force.at, force.at_rest))
+    return share_before(begins + force.duration, dt, force.duration) - share_before(begins, dt, dt)
+
+
+def share_before(ahead: Array, dt: Array, size: Array) -> Array:
+    """The share of a step that lies before a time so far ahead of its start; exactly 0 or 1 if it is one of its ends.
+
+    The time is known to rounding of a `size` [s]. At the start of a step derivatives are those of a time within it, at
+    the end those of a time that is over: a time that is both counts once.
+    """
+    share = ahead / dt
     whole = jnp.round(share)
-    rounding = 4 * jnp.finfo(share.dtype).eps * (1 + jnp.abs(t) / dt)
-    return jnp.clip(jnp.where(jnp.abs(share - whole) <= rounding, whole, share), 0.0, 1.0)
+    rounding = 2 * float(jnp.finfo(share.dtype).eps) * (1 + size / dt)
+    move = jnp.where(jnp.abs(share - whole) <= rounding, whole - share, 0.0)
+    share = share + lax.stop_gradient(move)
+    return jnp.where(share < 0, 0.0, jnp.where(share < 1, share, 1.0))

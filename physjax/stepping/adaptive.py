@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.lanes import any_lane, wide
+from physjax.loops import Time, now
 from physjax.particles import demand_particles
 from physjax.scene import as_module, project
 from physjax.vectors import norm
@@ -53,7 +54,7 @@ class Adaptive(eqx.Module):
     error: str = eqx.field(static=True)
     tries: int | None = eqx.field(static=True)
 
-    def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
 
@@ -73,7 +74,7 @@ class Adaptive(eqx.Module):
             )
         return scene
 
-    def report(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Steps:
+    def report(self, system: Any, t: Time, state: Any, dt: Time) -> Steps:
         """The state a dt later, with the counts of accepted and rejected steps."""
         shape, kind = getattr(system, "status_shape", ()), jax.tree.leaves(state)[0].dtype
         dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
@@ -109,10 +110,10 @@ class Adaptive(eqx.Module):
         last = walk.h >= left
         h = jnp.where(last, left, jnp.where(2 * walk.h > left, left / 2, walk.h))
         h = jnp.where(going, h, 0.0)
-        now = t + walk.elapsed
-        whole = self._stepped(system, now, walk.state, h)
-        middle = self._stepped(system, now, walk.state, h / 2)
-        halves = self._stepped(system, now + h / 2, middle, h / 2)
+        begun = t + walk.elapsed
+        whole = self._stepped(system, begun, walk.state, h)
+        middle = self._stepped(system, begun, walk.state, h / 2)
+        halves = self._stepped(system, begun + h / 2, middle, h / 2)
         error = lax.stop_gradient(self._error(walk.state, whole, halves, h.shape))
         good = going & (error <= 1.0)
         bad = going & ~good
@@ -285,17 +286,15 @@ def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
 
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
 
-    """When forces of a system jump, after t [s]: `(*shape, k)` each, or with axes of length 1 where all share them."""
 
-
-def _jumps(system: Any, t: ArrayLike, shape: tuple) -> list[Array]:
+def _jumps(system: Any, t: Time, shape: tuple) -> list[Array]:
     """When forces of a system jump, after t [s]: `(*shape, k)` each."""
     found = []
     for force in getattr(system, "forces", ()):
         for times in getattr(force, "discontinuities", tuple)():
             own = shape and times.shape[: len(shape)] == shape
             times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
-            found.append(times - jnp.broadcast_to(t, shape)[..., None])
+            found.append(times - jnp.broadcast_to(now(t), shape)[..., None])
     return found
 
 

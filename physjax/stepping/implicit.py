@@ -15,6 +15,7 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from physjax.lanes import any_lane
+from physjax.loops import Time
 from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, solved, stabilised_biconjugate_gradients
 from physjax.stepping.registry import Promises
 from physjax.vectors import scale
@@ -62,7 +63,7 @@ class ImplicitEuler(eqx.Module):
     def __name__(self) -> str:
         return "implicit_euler" if not self.newton else "implicit_euler, converged"
 
-    def __call__(self, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> Any:
+    def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         """The state after a step dt [s] from the time t [s]."""
         return self._step(system, t, state, dt)[0]
 
@@ -156,13 +157,13 @@ class _Step(NamedTuple):
     """A step to be solved: the system, the end of the step [s], the start's state, and which of its leaves a kick changes."""
 
     system: Any
-    end: ArrayLike
+    end: Time
     state: Any
     dt: ArrayLike
     places: tuple[bool, ...]
 
     @classmethod
-    def of(cls, system: Any, t: ArrayLike, state: Any, dt: ArrayLike) -> "_Step":
+    def of(cls, system: Any, t: Time, state: Any, dt: ArrayLike) -> "_Step":
         places = []
 
         def kick(state):

@@ -18,10 +18,10 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.closures import warn_of_remade
 from physjax.lanes import FEWEST, in_pieces
-from physjax.loops import repeat, time_at
+from physjax.loops import LAST_STEP, moment_at, repeat, time_at
 from physjax.scene import Scene, as_module, changes, plain_functions
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
@@ -44,8 +44,9 @@ def simulate(
     Give `steps`, or a `duration` [s] that is a multiple of `dt` [s]. `dt` is a scalar or shaped like
     `scene.status_shape`. Frame 0 is the start. `record=f(t, state)` keeps only that instead of the whole state; name
     the function once, a new one compiles anew. `first_step` continues the count of time: `simulate(flight.final_scene,
-    ..., first_step=flight.final_step)` resumes a run. Under jit, vmap, jvp and grad as well. Raises ValueError or
-    TypeError for bad numbers; a run that blows up returns with `.ok` False and `.first_bad_step`, it does not raise.
+    ..., first_step=flight.final_step)` resumes a run, up to step 2³¹ - 1. Under jit, vmap, jvp and grad as well. Raises
+    ValueError or TypeError for bad numbers; a run that blows up does not raise, it returns with `.ok` False and
+    `.first_bad_step`.
 
     JAX keeps the compiled program of every scene that differs in more than numbers, some megabytes each; where there
     are thousands in one process, `jax.clear_caches()` frees them.
@@ -72,7 +73,7 @@ def simulate(
         raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
     method = as_module(method)
     warn_of_remade("simulate", (*(plain.function for plain in plain_functions((scene, method))), record))
-    first_step = jnp.asarray(first_step, jnp.int32)
+    first_step, dt = _checked_count(first_step, steps, dt)
     rollout = _rollout
     if record is None and _stands_alone((scene, method, dt, first_step)):
         rollout = _rollout_of_few if _is_mostly_compiled(scene) else _rollout_alone
@@ -162,7 +163,7 @@ def _step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
     """Step number i of a loop."""
     if scene.in_pieces and jax.default_backend() == "cpu":
         scene = scene.having(state=jax.tree.map(lambda leaf: in_pieces(leaf, i), scene.state))
-    return scene.step(method, time_at(i, dt, scene.state.dtype), dt)
+    return scene.step(method, moment_at(i, dt, scene.state.dtype), dt)
 
 
 @partial(jax.jit, static_argnames=("frames",))
@@ -237,6 +238,18 @@ def changing_parts(scene: Scene, dt: ArrayLike) -> Any:
     contacts = tuple(map(changes, scene.contacts))
     state, emitter = jax.tree.map(lambda _: True, scene.state), changes(scene.emitter)
     return mask[0].having(state=state, contacts=contacts, emitter=emitter)
+
+
+def _checked_count(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Array, Array]:
+    """The first step in 32 bits; the last must fit as well, or time would run backwards: a traced one makes dt NaN."""
+    number = concrete(first_step)
+    if number is not None and number.size and number.max() > LAST_STEP - steps:
+        raise ValueError(
+            f"first_step: got {number.max()} and {steps} steps, expected at most {LAST_STEP} together: steps are counted in "
+            "32 bits. Take longer steps, or begin a new count: first_step=0, with what follows the clock moved by as much."
+        )
+    fits = True if number is not None else jnp.asarray(first_step) <= LAST_STEP - steps
+    return jnp.asarray(first_step, jnp.int32), dt if fits is True else jnp.where(fits, dt, jnp.nan)
 
 
 def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:

@@ -16,7 +16,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.loops import time_at
+from physjax.loops import Moment, Time, moment_at, now
 from physjax.physics.collide import collide, collisions
 from physjax.physics.contacts import impact, project
 from physjax.physics.impact import Flight, flights
@@ -54,7 +54,7 @@ def _booked_run(run: Any, substeps: Array) -> tuple[Books, Books]:
         def step(i, carry):
             moving, books = carry
             count = run.first_step + number * run.save_every + i
-            t = time_at(count, run.dt, scene.state.dtype)
+            t = moment_at(count, run.dt, scene.state.dtype)
             after, books = _step(eqx.combine(moving, still), run.stepper, t, run.dt, substeps, books)
             return eqx.filter(after, changes), books
 
@@ -131,7 +131,13 @@ def _potential(force: Any, scene: Scene, t: ArrayLike, state: Any) -> Array:
     return energy.summed(scene, force.potential(t, *state.shown_to(force, scene.mass)))
 
 
-def _step(scene: Scene, method: Any, t: Array, dt: Array, substeps: Array, books: Books) -> tuple[Scene, Books]:
+def _in_float64(t: Moment) -> Array:
+    """A moment as one number, which in float64 holds all of it."""
+    start, rest, elapsed = in_float64((t.start, t.rest, 0.0 if t.elapsed is None else t.elapsed))
+    return start + (rest + elapsed)
+
+
+def _step(scene: Scene, method: Any, t: Time, dt: Array, substeps: Array, books: Books) -> tuple[Scene, Books]:
     """One step of the run, entered in the books: its motion, touches, what leads nodes, and what parts."""
     motion = partial(free_motion, method)
     enter = partial(_entered, in_float64(scene), substeps)
@@ -142,18 +148,18 @@ def _step(scene: Scene, method: Any, t: Array, dt: Array, substeps: Array, books
         moved = motion(scene, t, dt).state
         books = enter(books, Flight(scene.state, scene, t, dt, moved, moved, None))
     after = scene.step(method, t, dt)
-    end, wide = (t + dt).astype(jnp.float64), in_float64(scene)
+    end, wide = _in_float64(t + dt), in_float64(scene)
     has = lambda state, at=wide: _amounts(at, end, in_float64(state))  # noqa: E731
 
     def change(books, name, before, now):
         return {**books, name: _plus(books[name], _minus(now, before))}
 
     if scene.led is not None:
-        led = scene.led.lead(t + dt, moved)
+        led = scene.led.lead(now(t + dt), moved)
         books, moved = change(books, NUMERICAL, has(moved), has(led)), led
     for name, contact in zip(named(scene.contacts), scene.contacts, strict=True):
         if (contact.response or project) is project:
-            answered = contact.answered(t + dt, moved, scene.mass)
+            answered = contact.answered(now(t + dt), moved, scene.mass)
             books, moved = change(books, name, has(moved), has(answered)), answered
     # held nodes that a contact moved are put back; without pins there is nothing left but rounding
     books = change(books, PINS if scene.pinned is not None else NUMERICAL, has(moved), has(after.state))
@@ -169,7 +175,7 @@ def _step(scene: Scene, method: Any, t: Array, dt: Array, substeps: Array, books
 def _entered(whole: Scene, substeps: Array, books: Books, flight: Flight) -> Books:
     """The books after a flight: works and impulses along the exact motion, and what the method and the touch made of it."""
     start, before, end, after = in_float64((flight.scene, flight.before, flight.end, flight.after))
-    t, duration = flight.begun.astype(jnp.float64), flight.duration.astype(jnp.float64)
+    t, duration = _in_float64(flight.begun), flight.duration.astype(jnp.float64)
     has = lambda t, state: _amounts(whole, t, state)  # noqa: E731
     exact, works, holding = _exact(whole, start, t, duration, substeps)
     names, contacts, _ = causes(whole)
