@@ -17,12 +17,14 @@ from jaxtyping import Array, Bool, Float
 from physjax.lanes import any_lane, apart, loop
 from physjax.loops import Time, now
 from physjax.scene import Particles, Scene
-from physjax.vectors import components, dot, scale, stacked, turn_left, unit
+from physjax.vectors import components, dot, norm, scale, stacked, turn_left, unit
 
 SETTLING = 400
 """Most passes to decide whether several surfaces hold a lane still: each shrinks what is left by cos² of their angle."""
 ENOUGH = 1e18
 """A coefficient of static friction that always suffices."""
+HAIR = 1e-15
+"""A speed [m/s] of nothing: a slide in space that is slower has the direction that was decided."""
 PARALLEL = 1e-5
 """Two surfaces whose normals differ by less (sin² of the angle) are one: the second carries nothing."""
 
@@ -31,16 +33,14 @@ class Reaction(eqx.Module):
     """The normal force N >= 0 of each surface a lane presses on, -μ_k N along its slip; lanes that are held stay still.
 
     `pressed` and `slip` are per surface: which lanes it carries, and the direction in which they slip at the start of
-    the step; a slide in space whose speed has a square below `slowest` [m²/s²] keeps that direction. A lane that would
-    turn around within the step is braked on beyond zero, so that the path stays smooth and the moment of the stop can be
-    found. No lane leans on more surfaces than space has dimensions: where there are more, `places` says which of them
-    takes each lane's first place, its second and so on.
+    the step. A lane that would turn around within the step is braked on beyond zero, so that the path stays smooth and
+    the moment of the stop can be found. No lane leans on more surfaces than space has dimensions: where there are more,
+    `places` says which of them takes each lane's first place, its second and so on.
     """
 
     surfaces: tuple
     pressed: tuple[Float[Array, "*lanes"], ...]
     slip: tuple[Float[Array, "*lanes dim"] | None, ...]
-    slowest: tuple[Float[Array, "*lanes"] | None, ...]
     still: Float[Array, "*lanes"]
     places: tuple[tuple[Float[Array, "*lanes"], ...], ...] | None
     anywhere: Bool[Array, ""]
@@ -70,28 +70,29 @@ class Reaction(eqx.Module):
         bend, normal = surface.bend(t, state.position, relative), components(outward)
         if self.slip[i] is None:
             return normal, bend, normal
-        direction = self._direction(i, outward, relative)
-        return normal, bend, _plus(normal, -surface.coulomb.kinetic, direction)
+        along, length = self._way(i, outward, relative)
+        return normal, bend, _plus(normal, -surface.coulomb.kinetic / length, along)
 
-    def _direction(self, i: int, outward: Array, relative: Array) -> list:
-        """Which way a lane slips: as it did at the start of the step, so that it is braked on beyond zero.
+    def _way(self, i: int, outward: Array, relative: Array) -> tuple[list, ArrayLike]:
+        """A vector along which a lane slips, and its length: as at the start of the step, so that it is braked on beyond zero.
 
         In the plane that is the surface's tangent, whose sign is decided: no division by the speed, which passes through
-        zero where a slide turns back. In space it is the direction of the velocity; what is slower than rounding has
-        that of the slip, as decided.
+        zero where a slide turns back. In space it is the velocity; what is slower than a hair has the way of the slip,
+        as decided.
         """
         slip = components(self.slip[i])
         if len(slip) == 2:
             tangent = components(turn_left(outward))
             sign = jnp.sign(_dot(tangent, slip))
-            return [sign * part for part in tangent]
+            return [sign * part for part in tangent], 1.0
         normal, across = components(outward), components(relative)
         across = _plus(across, -_dot(across, normal), normal)
         forwards = jnp.where(_dot(across, slip) < 0, -1.0, 1.0)
-        square = _dot(across, across)
-        moving = square > self.slowest[i]
-        inverse = jnp.where(moving, forwards / jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)
-        return [jnp.where(moving, inverse * part, way) for part, way in zip(across, slip, strict=True)]
+        # a hair of the slip's direction stands in where nothing moves yet: alone, or what is left is divided by the hair
+        forwards = jnp.where(_dot(across, across) > HAIR * HAIR, forwards, 0.0)
+        across = [forwards * part + HAIR * hair for part, hair in zip(across, slip, strict=True)]
+        speed = norm(stacked(across))
+        return across, jnp.where(speed > 0, speed, 1.0)
 
 
 class Held(NamedTuple):
@@ -101,7 +102,6 @@ class Held(NamedTuple):
     since: tuple[Array, ...]
     pressed: tuple[Array, ...]
     slip: tuple[Array | None, ...]
-    slowest: tuple[Array | None, ...]
     still: Array
 
 
@@ -122,14 +122,14 @@ def hold(scene: Scene, surfaces: tuple, since: tuple, t: Time, dt: ArrayLike) ->
         return [_contact(s, t, at, mask, speed) for s, mask in zip(surfaces, masks, strict=True)]
 
     contacts, unheld = lax.stop_gradient(apart(flag, look)), components(unheld)
-    pressed, still, slip, slowest = apart(flag, lambda: _decided(surfaces, contacts, unheld, touching))
+    pressed, still, slip = apart(flag, lambda: _decided(surfaces, contacts, unheld, touching))
     since = tuple(jnp.where(p > 0, s, jnp.inf) for p, s in zip(pressed, since, strict=True))
     # what stands still on a surface that does too keeps its place to the last bit: nothing creeps
     moves = [p * (1 - still) if s.velocity is None else p for p, s in zip(pressed, surfaces, strict=True)]
     x, v = _put_back(surfaces, moves, t, scene.state, flag)
     for surface, p in zip(surfaces, pressed, strict=True):
         v = v - scale(still * p, surface.relative(v))
-    return Held(Particles(x, v), since, pressed, slip, slowest, still)
+    return Held(Particles(x, v), since, pressed, slip, still)
 
 
 def _decided(surfaces: tuple, contacts: list["_Contact"], unheld: list[Array], touching: list[Array]) -> tuple:
@@ -146,27 +146,24 @@ def _decided(surfaces: tuple, contacts: list["_Contact"], unheld: list[Array], t
     balanced = _dot(acceleration, acceleration) <= left**2 * _dot(unheld, unheld)
     still = (jnp.any(jnp.stack(pressed), axis=0) & quiet & balanced).astype(dtype)
     pressed = tuple(p.astype(dtype) for p in pressed)
-    slip, slowest = [], []
+    slip = []
     for surface, contact, p in zip(surfaces, contacts, pressed, strict=True):
-        slowest.append(contact.slowest if surface.coulomb is not None and len(unheld) > 2 else None)
         way = [jnp.where(contact.still, a, u) for a, u in zip(acceleration, contact.across, strict=True)]
         slip.append(None if surface.coulomb is None else scale(p * (1 - still), unit(stacked(way))))
-    return pressed, still, tuple(slip), tuple(slowest)
+    return pressed, still, tuple(slip)
 
 
 def nothing_held(scene: Scene, surfaces: tuple, since: tuple) -> Held:
     """What `hold` returns where no lane touches anything."""
     nothing, nowhere = jnp.zeros(scene.state.lanes, scene.state.dtype), jnp.zeros_like(scene.state.velocity)
-    rough = [surface.coulomb is not None for surface in surfaces]
-    slip = tuple(nowhere if so else None for so in rough)
-    slowest = tuple(nothing if so and nowhere.shape[-1] > 2 else None for so in rough)
-    return Held(scene.state, since, tuple(nothing for _ in surfaces), slip, slowest, nothing)
+    slip = tuple(None if surface.coulomb is None else nowhere for surface in surfaces)
+    return Held(scene.state, since, tuple(nothing for _ in surfaces), slip, nothing)
 
 
 def carried(scene: Scene, surfaces: tuple, held: Held) -> Scene:
     """The scene with the lanes held as decided, ready for a step."""
     anywhere = any_lane(jnp.any(jnp.stack(held.pressed) > 0, axis=0))
-    reaction = Reaction(surfaces, held.pressed, held.slip, held.slowest, held.still, _places(held), anywhere)
+    reaction = Reaction(surfaces, held.pressed, held.slip, held.still, _places(held), anywhere)
     return scene.having(state=held.state, reaction=reaction)
 
 
@@ -221,14 +218,13 @@ def _solved(weights: list[list[Array]], wanted: list[Array], presses: list[Array
 class _Contact(NamedTuple):
     """A surface as a lane feels it: normal, bend, tangential velocity, and what friction can hold.
 
-    The lane stands `still` where the square of that velocity is not above `slowest`. Vectors are lists of components.
+    The lane stands `still` where that velocity is rounding. Vectors are lists of components.
     """
 
     touching: Array
     normal: list[Array]
     bend: Array
     across: list[Array]
-    slowest: Array
     still: Bool[Array, "*lanes"]
     limit: Array | None
 
@@ -239,13 +235,12 @@ def _contact(surface: eqx.Module, t: ArrayLike, state: Particles, touching: Arra
     normal, across = components(outward), components(relative)
     across = _plus(across, -_dot(across, normal), normal)
     rounding = 16 * float(jnp.finfo(state.dtype).eps)
-    slowest = rounding**2 * speed_squared
-    still = _dot(across, across) <= slowest
+    still = _dot(across, across) <= rounding**2 * speed_squared
     limit = None if surface.coulomb is None else surface.coulomb.static
     if surface.friction is not None:
         # every one of the endless bounces takes its part of the tangential velocity: nothing is left
         limit = jnp.where(surface.friction > 0, ENOUGH, 0.0).astype(state.dtype)
-    return _Contact(touching, normal, surface.bend(t, state.position, relative), across, slowest, still, limit)
+    return _Contact(touching, normal, surface.bend(t, state.position, relative), across, still, limit)
 
 
 def _settle(contacts: list[_Contact], acceleration: list[Array]) -> tuple[list[Array], list[Array]]:
