@@ -332,6 +332,9 @@ def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped
     """The pytree `like` with its leaves replaced by the file's arrays of that group, of the same shapes if so `shaped`."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]
+    # what rounding leaves out of a moment was nothing in files from before it was kept
+    rests = [name for name in names if name.endswith("_rest") and name.removesuffix("_rest") in arrays]
+    arrays = {name: np.zeros_like(arrays[name.removesuffix("_rest")]) for name in rests} | arrays
     missing = [name for name in names if name not in arrays]
     if missing:
         raise ValueError(

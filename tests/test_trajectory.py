@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, Trajectory, contacts, forces, methods, reference, simulate
+from physjax import Particles, Scene, Trajectory, contacts, emitters, forces, methods, reference, simulate
 from physjax.stepping.methods import METHODS
 from physjax.trajectory import memories
 from physjax.vectors import scale, upward
@@ -426,3 +426,18 @@ def test_a_run_of_float64_is_never_rounded(tmp_path):
         np.testing.assert_array_equal(loaded.velocity, run.velocity)
         with pytest.raises(ValueError, match=r"in float64, the given scene in float32.*jax_enable_x64"):
             Trajectory.load(tmp_path / "run.npz", scene=rockets())
+
+
+def test_a_file_from_before_rests_of_moments_were_kept_still_loads(tmp_path):
+    jet = emitters.Emitter(4, emitters.Point((0.0, 0.0)), key=0, life=1.0, speed=5.0, rate=4.0)
+    spray = Scene(jet.unborn(), forces=(forces.Gravity(),), emitter=jet)
+    flight = simulate(spray, methods.euler, dt=0.1, steps=4, save_every=2)
+    flight.save(tmp_path / "new.npz")
+    with np.load(tmp_path / "new.npz") as file:
+        np.savez(tmp_path / "old.npz", **{name: file[name] for name in file.files if not name.endswith("_rest")})
+    old, new = (Trajectory.load(tmp_path / name, scene=spray, method=methods.euler) for name in ("old.npz", "new.npz"))
+    again = [
+        simulate(run.final_scene, methods.euler, dt=0.1, steps=4, first_step=run.final_step).position
+        for run in (old, new)
+    ]
+    np.testing.assert_array_equal(*again)

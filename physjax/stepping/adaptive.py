@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.lanes import any_lane, wide
-from physjax.loops import Time, now
+from physjax.loops import Time, moment_at, now
 from physjax.particles import demand_particles
 from physjax.scene import as_module, project
 from physjax.vectors import norm
@@ -279,7 +279,7 @@ def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
 
     def one(arrays, i):
         scene = eqx.combine(arrays, still)
-        t = i.astype(scene.state.dtype) * dt
+        t = moment_at(i, dt, scene.state.dtype)
         told = method.report(scene, t, scene.state, dt)
         after = scene.step(method, t, dt)
         return eqx.filter(after, eqx.is_array), told._replace(state=after.state)
