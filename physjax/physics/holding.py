@@ -88,9 +88,11 @@ class Reaction(eqx.Module):
         normal, across = components(outward), components(relative)
         across = _plus(across, -_dot(across, normal), normal)
         forwards = jnp.where(_dot(across, slip) < 0, -1.0, 1.0)
-        # a hair of the slip's direction stands in where nothing moves yet: alone, or what is left is divided by the hair
-        forwards = jnp.where(_dot(across, across) > HAIR * HAIR, forwards, 0.0)
+        # a hair of the slip's direction stands in where nothing moves yet
         across = [forwards * part + HAIR * hair for part, hair in zip(across, slip, strict=True)]
+        # and its derivatives are none: a choice between equals, which the compiler drops where nothing is differentiated
+        moving = norm(stacked(across)) > 2 * HAIR
+        across = [jnp.where(moving, part, lax.stop_gradient(part)) for part in across]
         speed = norm(stacked(across))
         return across, jnp.where(speed > 0, speed, 1.0)
 
