@@ -144,9 +144,14 @@ def changes(part: Any) -> Any:
     return eqx.tree_at(where, mask, [True] * len(part.memory)) if getattr(part, "memory", ()) else mask
 
 
-def under_one_gravity(forces: list) -> tuple:
-    """The forces, agreed about g and which axis is up: those of `Gravity`, of several the sum."""
+def under_one_gravity(forces: list, dim: int) -> tuple:
+    """The forces, agreed about g and which axis of `dim` is up: those of `Gravity`, of several the sum."""
     weights = [force.weight for force in forces if isinstance(force, Force) and force.weight is not None]
+    for _, up in weights:
+        if up >= dim:
+            raise ValueError(
+                f"up: Gravity acts along the axis {up}, but places here have {dim} components, 0 to {dim - 1}."
+            )
     if not weights:
         return tuple(forces)
     if len(axes := {up for _, up in weights}) > 1:

@@ -110,7 +110,7 @@ class Scene(eqx.Module):
             state = state.held(1 - pinned.astype(dtype))
         self.mass = mass
         forces = [prepared_force(force, dtype) for force in listed("force", forces)]
-        self.forces = under_one_gravity(forces)
+        self.forces = under_one_gravity(forces, state.position.shape[-1])
         self.contacts = tuple(prepared_contact(contact, dtype) for contact in listed("contact", contacts))
         for part in (*self.forces, *self.contacts):
             demand_fitting_numbers(part, lanes, state.position.shape[-1])

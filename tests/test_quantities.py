@@ -127,6 +127,41 @@ def test_a_gravity_vector_along_an_axis_is_the_g_along_it():
 
 
 @pytest.mark.parametrize(
+    ("about", "up"),
+    [
+        ({"vector": np.tile([0.0, 0.0, -9.8], (4, 1))}, 2),
+        ({"vector": (0.1, 0.0, -9.8)}, 2),
+        ({"vector": (0.1, -9.0, -1.0)}, 1),
+        ({"vector": (0.0, 9.8, 0.0)}, 1),
+        ({"vector": (0.1, 0.0, -9.8), "up": 1}, 1),
+    ],
+)
+def test_the_axis_that_is_up_is_the_one_a_gravity_vector_pulls_against(about, up):
+    state = Particles(jnp.zeros((4, 3)), jnp.ones((4, 3)))
+    scene = Scene(state, forces=(forces.Gravity(**about),))
+    assert scene.up == up
+    np.testing.assert_allclose(scene.acceleration(0.0, state), np.broadcast_to(about["vector"], (4, 3)), rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("given", "fault"),
+    [
+        (lambda: forces.Gravity(up="z"), r"up \(0: x, 1: y, 2: z\): got str 'z', expected an integer"),
+        (lambda: forces.Gravity(up=True), "got bool True, expected an integer"),
+        (lambda: forces.Gravity(up=-1), "got -1, expected at least 0"),
+        (lambda: forces.Buoyancy(1.0, volume=1.0, up="z"), "got str 'z', expected an integer"),
+        (lambda: forces.Gravity(5.0, vector=(0.0, -9.8)), "both g = 5.0 and a vector, expected one"),
+        (lambda: forces.Gravity(up=2, vector=(0.0, -9.8, 0.0)), "up = 2, but a vector down the axis 1"),
+        (lambda: Scene(BALL, forces=(forces.Gravity(up=2),)), "along the axis 2, but places here have 2 components"),
+        (lambda: Scene(BALL, forces=(forces.Gravity(vector=(0.0, 0.0, -9.8)),)), "along the axis 2, but places here"),
+    ],
+)
+def test_an_axis_or_a_gravity_that_cannot_be_is_refused_at_once(given, fault, unannotated):
+    with pytest.raises((TypeError, ValueError), match=fault):
+        given()
+
+
+@pytest.mark.parametrize(
     ("weight", "axis"), [({"g": 1.62}, 1), ({"g": 9.81}, 1), ({"up": 2}, 2), ({"vector": (0, 0, -3)}, 2)]
 )
 def test_what_floats_in_balance_stays_where_only_gravity_is_told_g_and_up(weight, axis, precision):
@@ -328,6 +363,11 @@ TRACED = {
     "restitution < 0": (lambda q: flight(contacts=floor(restitution=q)), 0.0, -0.5),
     "friction": (lambda q: flight(contacts=floor(friction=q)), 0.5, 2.0),
     "kinetic over static": (lambda q: flight(contacts=floor(coulomb=contacts.Coulomb(0.5, q))), 0.5, 0.6),
+    "g of the fluid": (
+        lambda q: flight(forces=(forces.Gravity(q), forces.Buoyancy(1.0, volume=0.1, g=9.8))),
+        9.8,
+        5.0,
+    ),
     "no direction": (
         lambda q: flight(contacts=(contacts.Plane((0.0, 0.0), jnp.stack([0 * q, q]), response=contacts.project),)),
         1.0,

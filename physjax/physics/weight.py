@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import concrete, quantity, real_array, real_quantity
+from physjax.checks import concrete, positive_integer, quantity, real_array, real_quantity
 from physjax.scene import Field, Force, Particles
 from physjax.vectors import dot, over, upward
 
@@ -21,8 +21,10 @@ G = 9.8
 class Gravity(Field):
     """Weight near the ground: F = m g, down the axis `up` (1: y). The lecture prints g = -9.8; here g > 0 and up is up.
 
-    `g` is a number >= 0; a whole vector, as other engines take it, is `Gravity(vector=(0.0, -9.8))`. Of a scene, other
-    forces that need g or up (`Buoyancy`) take those of its `Gravity`. Raises ValueError for a negative g.
+    `g` is a number >= 0; a whole vector, as other engines take it, is `Gravity(vector=(0.0, -9.8))`, one for all lanes or
+    one per lane. Up is then the axis against which it pulls most; a traced one has to be told (`up=2`) where that is not
+    y. Of a scene, other forces that need g or up (`Buoyancy`) take those of its `Gravity`. Raises ValueError for a
+    negative g, a g beside a vector, and an axis that a straight vector does not point down.
 
     Example:
         >>> print(forces.Gravity()(0.0, ball, shot.mass))
@@ -34,12 +36,25 @@ class Gravity(Field):
     up: int = eqx.field(static=True, default=1)
     vector: Float[Array, "..."] | None = quantity("gravity", "m/s²", kind="vector", default=None)
 
-    def __init__(self, g: Any = 9.8, up: int = 1, *, vector: Any = None):
-        self.g, self.up, self.vector = _downward(g), up, None
-        if vector is not None:
-            self.vector = real_quantity("gravity [m/s²]", vector)
-            straight = _along_an_axis(self.vector)
-            self.g, self.up, self.vector = (None, up, self.vector) if straight is None else (*straight, None)
+    def __init__(self, g: Any = 9.8, up: int | None = None, *, vector: Any = None):
+        up = None if up is None else axis_number(up)
+        if vector is None:
+            self.g, self.up, self.vector = _downward(g), 1 if up is None else up, None
+            return
+        if g is not None and not (isinstance(g, float) and g == G):
+            raise ValueError(
+                f"Gravity: got both g = {g} and a vector, expected one of them: Gravity(vector=...) has its g."
+            )
+        self.vector = real_quantity("gravity [m/s²]", vector)
+        straight = _along_an_axis(self.vector)
+        if straight is None:
+            self.g, self.up = None, _steepest_axis(self.vector) if up is None else up
+            return
+        self.g, self.up, self.vector = *straight, None
+        if up not in (None, self.up):
+            raise ValueError(
+                f"Gravity: got up = {up}, but a vector down the axis {self.up}; expected one axis. Leave up out."
+            )
 
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-g along the upward axis [m/s²]."""
@@ -85,6 +100,8 @@ class Buoyancy(Force):
     up: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
+        if self.up is not None:
+            axis_number(self.up)
         given = (self.volume is not None, self.radius is not None, self.surface is not None)
         if given not in ((True, False, False), (False, True, True)):
             raise ValueError(
@@ -113,6 +130,9 @@ class Buoyancy(Force):
                 f"Buoyancy: got {told}, but the scene's Gravity has {weighs}; expected one g and one axis for both. Leave "
                 "them out of Buoyancy, which then takes those of the scene."
             )
+        if self.g is not None and (given is None or scene is None):
+            # traced numbers cannot raise: where they differ, the lane is spoilt
+            return replace(self, g=jnp.where(self.g == g, self.g, jnp.nan), up=up)
         return replace(self, g=g if self.g is None else self.g, up=up)
 
     def displaced(self, state: Particles) -> Float[Array, "..."]:
@@ -143,6 +163,11 @@ class Buoyancy(Force):
         return 1 if self.up is None else self.up
 
 
+def axis_number(up: Any) -> int:
+    """An axis as a Python int, 0 for x; TypeError or ValueError for what is none."""
+    return positive_integer("up (0: x, 1: y, 2: z)", up, at_least=0)
+
+
 def _downward(g: Any) -> Array:
     """g as a number >= 0; what other engines are given, a vector or a negative number, gets an error with the right call."""
     value = real_array("g [m/s²]", g)
@@ -157,9 +182,18 @@ def _downward(g: Any) -> Array:
 
 
 def _along_an_axis(vector: Array) -> tuple[Array, int] | None:
-    """g and the axis that is up of a gravity vector that points straight down an axis; None of any other, or a traced one."""
+    """g and the axis that is up of a gravity that points straight down one axis in all lanes; None of others, or a traced one."""
     values = concrete(vector)
-    if values is None or values.ndim != 1 or np.count_nonzero(values) != 1 or values.sum() > 0:
+    if values is None or not values.ndim or np.any(values > 0):
         return None
-    axis = int(np.flatnonzero(values)[0])
-    return -vector[axis], axis
+    axes = np.flatnonzero(np.any(values.reshape(-1, values.shape[-1]) != 0, axis=0))
+    return (-vector[..., axes[0]], int(axes[0])) if len(axes) == 1 else None
+
+
+def _steepest_axis(vector: Array) -> int:
+    """The axis against which a slanting gravity pulls most, over all lanes; y of one that is traced, or pulls along axes only."""
+    values = concrete(vector)
+    if values is None or values.ndim == 0 or values.shape[-1] == 1:
+        return 1
+    pull = values.reshape(-1, values.shape[-1]).sum(axis=0)
+    return 1 if pull[1] == pull.min() or pull.min() >= 0 else int(np.argmin(pull))
