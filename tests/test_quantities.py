@@ -13,6 +13,7 @@ from physjax import (
     Particles,
     Scene,
     contacts,
+    emitters,
     forces,
     methods,
     projectile,
@@ -368,6 +369,16 @@ TRACED = {
         9.8,
         5.0,
     ),
+    "adaptive dt": (
+        lambda q: simulate(Scene(BALL), methods.adaptive(methods.euler, atol=0.1, rtol=0.1), dt=q, steps=2),
+        0.1,
+        -0.1,
+    ),
+    "tolerance": (
+        lambda q: simulate(Scene(BALL), methods.adaptive(methods.euler, atol=q, rtol=0.1), dt=0.1, steps=2),
+        0.1,
+        -0.1,
+    ),
     "no direction": (
         lambda q: flight(contacts=(contacts.Plane((0.0, 0.0), jnp.stack([0 * q, q]), response=contacts.project),)),
         1.0,
@@ -414,6 +425,20 @@ def test_a_traced_number_beyond_its_bounds_is_a_status_of_its_lane(name, unannot
     np.testing.assert_array_equal(ok, [True, False, True])
     np.testing.assert_array_equal(ends[0], ends[2])
     np.testing.assert_allclose(ends[0], run(good).final_scene.state.position, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("bad", ["life", "drag"])
+def test_a_birth_does_not_put_right_what_a_traced_number_has_spoilt(bad):
+    def run(q):
+        life, drag = (q, 1.0) if bad == "life" else (1.0, jnp.stack([jnp.ones_like(q), q, jnp.ones_like(q)]))
+        jet = emitters.Emitter(3, emitters.Point((0.0, 0.0)), key=1, life=life, rate=100.0, drop_oldest=True)
+        scene = Scene(jet.unborn(), 1e-3, (forces.StokesDrag(drag),), emitter=jet)
+        return simulate(scene, methods.euler, dt=0.01, steps=3).ok
+
+    right = [True, True, True]
+    np.testing.assert_array_equal(
+        jax.jit(jax.vmap(run))(jnp.array([1.0, -1.0])), [right, [False] * 3 if bad == "life" else [True, False, True]]
+    )
 
 
 def test_one_bad_lane_among_traced_ones_harms_no_other():

@@ -260,6 +260,10 @@ class Emitter(eqx.Module):
             raise ValueError("emitter: got pinned= as well, expected one of them: who is not alive is held already.")
         never, nothing = jnp.full(self.pool, jnp.inf, state.dtype), jnp.zeros(self.pool, state.dtype)
         unborn = jnp.full(self.pool, -1, jnp.int32)
+        if isinstance(state.position, jax.core.Tracer):
+            # a lane that a traced number has spoilt is never born, or its birth would put it right
+            spoilt = jnp.any(jnp.isnan(state.position), axis=-1)
+            unborn = jnp.where(spoilt, jnp.iinfo(jnp.int32).max, unborn)
         return self._cast(state.dtype)._remembering(unborn, never, nothing, -never, nothing)
 
     def live(self, motion: Callable, scene: Any, t: Time, dt: ArrayLike) -> Any:

@@ -95,7 +95,10 @@ class Adaptive(eqx.Module):
             end = lax.while_loop(lambda walk: any_lane(walk.going(dt)), attempt, start)
         else:
             end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
-        ok = ~end.failed & ~end.going(dt)
+        # a dt or a tolerance that is traced cannot raise; one that is not > 0 has no end and no error
+        bounds = (dt, *(b for b in (self.atol, self.rtol, self.dt_min, self.dt_max) if b is not None))
+        legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, jax.core.Tracer)]
+        ok = reduce(jnp.logical_and, legal, ~end.failed & ~end.going(dt))
         # a product and no choice: the derivatives of what is not a number are none either, where a choice would say zero
         state = jax.tree.map(lambda leaf: leaf * wide(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state)
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
