@@ -133,7 +133,7 @@ class Sphere(Surface):
 
     def may_dip(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
         """Whether the path may enter the ball: its chord comes closer than the radius and the path's own bow together."""
-        dips = super().may_dip(t, dt, start, end)
+        dips = self.may_dip_as_cubic(t, dt, start, end)
         if self.inside:
             return dips
         p, chord = self._offset(t, start.position), self._offset(t + dt, end.position)

@@ -23,9 +23,10 @@ from physjax.checks import declared, demand_legal, real_quantity
 from physjax.particles import Particles
 from physjax.physics.bodies import RigidBodies, angular_velocity, in_world
 from physjax.physics.collide import Felt, collide
-from physjax.physics.contacts import Sphere, Surface
+from physjax.physics.contacts import Surface
 from physjax.physics.impulses import Points
 from physjax.physics.inertia import Inertia
+from physjax.physics.paths import lowest_on_path
 from physjax.scene import Contact
 from physjax.vectors import cross, scale
 
@@ -168,10 +169,12 @@ class Touch(Contact):
     @property
     def narrow(self) -> bool:
         """Whether a fast point may pass through the surface and out again within a step: a ball, not a wall or a plate."""
-        return isinstance(self.surface, Sphere) and not self.surface.inside
+        return self.surface.curved and not getattr(self.surface, "inside", False)
 
     def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
         """Where in a leg a point comes lowest, as a share of it, and its gap there, as the surface finds it."""
+        if self.surface.curved and type(self.surface).deepest is Surface.deepest:
+            return lowest_on_path(self, t, dt, start, end, dip)  # a radius around each point
         radius = self._radius(start.position)
         share, depth = self.surface.deepest(t, dt, start, end, (dip[0], dip[1] + radius))
         return share, depth - radius

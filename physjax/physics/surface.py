@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import declared, quantity
 from physjax.physics.impact import impact
+from physjax.physics.paths import lowest_on_path, reach
 from physjax.physics.rebound import Coulomb, rebound
 from physjax.scene import Contact, Particles, project
 from physjax.vectors import dot, norm, over, scale, unit
@@ -95,8 +96,11 @@ class Surface(Contact):
         return jax.jvp(lambda x: self.outward(t, x), (position,), (relative,))[1]
 
     def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
-        """Where in a step the path comes lowest, as a share of it, and its gap there; `dip` is what the gap's cubic says."""
-        return dip
+        """Where in a step the path comes lowest, as a share of it, and its gap there; `dip` is what the gap's cubic says.
+
+        Where the surface is curved the path is followed, by the distance that it has to go at least.
+        """
+        return lowest_on_path(self, t, dt, start, end, dip) if self.curved else dip
 
     def may_meet(
         self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
@@ -109,7 +113,15 @@ class Surface(Contact):
         return jnp.where(touching[0], (dot(before, after) <= 0) & (dot(before, before) > 0), meets)
 
     def may_dip(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
-        """Whether the gap may fall below zero within a step: a cubic stays above the lowest of its four control points."""
+        """Whether the gap may fall below zero within a step; over a curved surface, whether the path reaches it at all."""
+        dips = self.may_dip_as_cubic(t, dt, start, end)
+        if not self.curved:
+            return dips
+        free = self.gap(t, start.position) + self.gap(t + dt, end.position)
+        return dips | (free < reach(self, dt, start, end))
+
+    def may_dip_as_cubic(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
+        """The same of a gap that is a cubic in time, which stays above the lowest of its four control points."""
         d0, d1 = self.gap(t, start.position), self.gap(t + dt, end.position)
         r0 = dt * dot(self.relative(start.velocity), self.outward(t, start.position))
         r1 = dt * dot(self.relative(end.velocity), self.outward(t + dt, end.position))

@@ -28,6 +28,20 @@ class Globe(contacts.Surface):
         return jnp.sqrt(jnp.sum(position * position, axis=-1)) - R
 
 
+class Pillar(contacts.Surface):
+    """A post along z, which says no more than its signed distance."""
+
+    def gap(self, t, position):
+        return jnp.hypot(position[..., 0], position[..., 1]) - 0.1
+
+
+class Sheet(contacts.Surface):
+    """A plate of a millimetre with two sides, which says no more than that."""
+
+    def gap(self, t, position):
+        return jnp.abs(position[..., 0] + 0.3 * position[..., 1] - 1) / np.sqrt(1.09) - 5e-4
+
+
 # nothing passes
 
 
@@ -119,6 +133,49 @@ def test_coupled_bodies_are_held_back_by_a_plate_and_lost_in_a_ball_that_they_pa
     assert runs[0].ok.tolist() == [False, True]
     assert runs[1].ok.all()
     assert (runs[1].position[-1, :, 0, 0] < 0).all()
+
+
+def darts(n):
+    """Starts and velocities of fast particles, past and onto a post and a plate behind it."""
+    x, v = np.zeros((n, 2)), np.zeros((n, 2))
+    x[:, 0], x[:, 1] = -1 - np.linspace(0, 1, n) * np.pi % 1, np.linspace(-0.2, 0.2, n)
+    v[:, 0] = np.linspace(0, 1, n) * np.e % 1 * 4 + 2
+    return Particles(jnp.asarray(x), jnp.asarray(v))
+
+
+def test_a_shape_of_ones_own_is_met_however_thin_it_is():
+    """Straight on for a second: from the signed distance alone a post is met as a circle is, a plate as a line."""
+    start = darts(200)
+    end = Particles(start.position + start.velocity, start.velocity)
+    nowhere = jnp.full(200, jnp.nan), jnp.zeros(200)
+
+    @jax.jit
+    def look(start, end):
+        shapes = Pillar(), Sheet()
+        return [(s.deepest(0.0, 1.0, start, end, nowhere), s.may_dip(0.0, 1.0, start, end)) for s in shapes]
+
+    post, plate = look(start, end)
+    y = np.asarray(start.position[:, 1])
+    ends = np.asarray(end.position[:, 0])
+    meets = (np.abs(y) < 0.1) & (ends > -np.sqrt(np.maximum(0.01 - y * y, 0)))
+    for (share, depth), may, hits in ((*post, meets), (*plate, ends + 0.3 * y > 1)):
+        np.testing.assert_array_equal(np.isfinite(share), hits)
+        assert hits.any()
+        assert not hits.all()
+        assert (np.asarray(depth)[hits] < 0).all()
+        assert may[hits].all()
+
+
+@pytest.mark.slow
+def test_particles_meet_shapes_of_ones_own_as_ours():
+    start = darts(64)
+    start = start._replace(velocity=40 * start.velocity)
+    ours = contacts.Sphere((0.0, 0.0), 0.1), contacts.Slab((1.0, 0.0), (1.0, 0.3), thickness=1e-3)
+    own, right = (
+        simulate(Scene(start, contacts=shapes), methods.rk4, dt=1 / 60, steps=6)
+        for shapes in ((Pillar(), Sheet()), ours)
+    )
+    np.testing.assert_allclose(own.position[-1], right.position[-1], atol=1e-9)
 
 
 # curved ground
