@@ -220,8 +220,11 @@ def adaptive(
     keeps the halves, otherwise the step is redone; the next is 0.8 E^(-1/(p+1)) times as long, p the method's order, at
     most 5 times, and less where the error has been growing. Every independent lane has steps of its own, and all land
     exactly on the end of dt: 3 times the evaluations of the method a try, and two to begin a dt with, so give it long
-    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`). Forces that remember and touches answered by
+    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`); a jump of one's own that neither `during` nor
+    `discontinuities` tells (see `Force`) can be stepped over. Forces that remember and touches answered by
     `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
+    Timed touches count by dt as well: a flight shorter than a quarter of dt is the last before rest, and after eight
+    touches in one dt a lane waits for the next, so take a dt in which few bounces happen.
 
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
@@ -294,7 +297,7 @@ def _jumps(system: Any, t: Time, shape: tuple) -> list[Array]:
     """When forces of a system jump, after t [s]: `(*shape, k)` each."""
     found = []
     for force in getattr(system, "forces", ()):
-        for times in getattr(force, "discontinuities", tuple)():
+        for times in map(jnp.asarray, getattr(force, "discontinuities", tuple)()):
             own = shape and times.shape[: len(shape)] == shape
             times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
             found.append(times - jnp.broadcast_to(now(t), shape)[..., None])

@@ -50,7 +50,7 @@ def ode_term(scene: Scene) -> "diffrax.ODETerm":
 
 def discontinuities(scene: Scene) -> Array:
     """Times [s] at which a force of the scene jumps, sorted: an adaptive solver must stop there."""
-    times = [jnp.ravel(t) for force in scene.forces for t in getattr(force, "discontinuities", tuple)()]
+    times = [jnp.ravel(jnp.asarray(t)) for force in scene.forces for t in getattr(force, "discontinuities", tuple)()]
     return jnp.sort(jnp.concatenate(times)) if times else jnp.zeros(0, scene.state.dtype)
 
 

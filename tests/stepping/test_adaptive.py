@@ -7,6 +7,7 @@ import pytest
 
 from physjax import Force, Particles, Scene, contacts, forces, methods, simulate, springs
 from physjax.scenes import SCENES
+from physjax.stepping import reference
 
 RK4 = methods.adaptive(methods.rk4, 1e-8, 1e-8)
 
@@ -245,6 +246,21 @@ def test_a_force_of_ones_own_that_tells_its_mean_but_no_times_is_seen_by_the_err
     run = simulate(scene, methods.adaptive(methods.rk4, 1e-7, 1e-7), dt=1.0, steps=1)
     assert run.ok
     assert float(run.position[-1, 0]) == pytest.approx(0.895, abs=1e-6)
+
+
+def test_a_force_of_ones_own_may_list_its_jumps_as_plain_numbers():
+    class Push(Force):
+        def __call__(self, t, state, mass):
+            return jnp.where(t >= 0.25, 2.0, 0.0) * jnp.ones_like(state.velocity)
+
+        def discontinuities(self):
+            return [0.25]
+
+    scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(Push(),))
+    assert reference.discontinuities(scene).tolist() == [0.25]
+    run = simulate(scene, methods.adaptive(methods.rk4, 1e-5, 1e-5), dt=1.0, steps=1)
+    assert run.ok
+    assert float(run.position[-1, 0]) == pytest.approx(0.75**2, abs=1e-4)
 
 
 def test_the_derivative_by_when_a_kick_comes_is_minus_its_velocity():
