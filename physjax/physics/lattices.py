@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 
 from physjax.checks import positive_integer, real_quantity
 from physjax.physics.aerodynamics import Cells, Triangles, Wind
-from physjax.physics.meshes import checked_mesh, read_mesh
+from physjax.physics.meshes import checked_mesh, near_pieces, read_mesh
 from physjax.physics.meshes import weld as join_vertices
 from physjax.physics.springs import Springs
 from physjax.scene import Particles
@@ -258,7 +258,8 @@ def from_mesh(
     has a third of the area around it. Sets: edge (on the boundary).
 
     Triangles hold together by the vertices they share. Vertices in one place become one node, with a warning that says
-    how many: those nearer than `weld` [m], unless told a millionth of the mesh's size. With `weld=0` all stay apart.
+    how many: those nearer than `weld` [m], unless told a millionth of the mesh's size. With `weld=0` all stay apart. Pieces
+    that share none, though they come within a tenth of the shortest edge, are warned of.
     Raises ValueError where no two triangles share a vertex even so.
 
     Example:
@@ -309,6 +310,13 @@ def _welded(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[
         raise ValueError(
             f"from_mesh: none of the {len(found.faces)} triangles shares a vertex with another, so that the sheet would fall "
             "apart. Give weld=, a distance [m] within which vertices are one; weld=0 if they are to be single triangles."
+        )
+    pieces, apart = near_pieces(found.vertices, found.faces) if tolerance is None else (0, 0.0)
+    if pieces:
+        warnings.warn(
+            f"from_mesh: {pieces} pieces of the mesh share no vertex though they come within {apart:.3g} m of each other, and no "
+            f"spring holds them together. Give weld={1.01 * apart:.3g} [m] to join them, weld=0 if they are to be apart.",
+            stacklevel=3,
         )
     return found.vertices, found.faces
 

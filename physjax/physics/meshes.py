@@ -19,7 +19,8 @@ CLOSE = 1e-6
 def read_mesh(path: str | os.PathLike, *, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Vertices `(n, 3)` and triangles `(m, 3)` of an .obj or .ply file; with trimesh also .stl, .glb and .gltf.
 
-    With `triangulate` faces of more corners are cut into triangles, fans around their first corner; else they are refused.
+    With `triangulate` faces of more corners are cut into triangles, fans around their first corner that sees all the others,
+    and refused where there is none; without it all of them are refused.
     What trimesh reads is welded, since STL never and GLB seldom shares vertices. Raises FileNotFoundError, ImportError
     without trimesh, or ValueError for a file that is truncated, not a mesh, or not understood in full.
     """
@@ -35,7 +36,7 @@ def read_mesh(path: str | os.PathLike, *, triangulate: bool = False) -> tuple[np
         welded = weld(*checked_mesh(*_read_with_trimesh(file), file.name))
         return welded.vertices, welded.faces
     vertices, polygons = _OURS[ending](file, triangulate)
-    return checked_mesh(vertices, _triangles(polygons), file.name)
+    return checked_mesh(vertices, _triangles(file.name, vertices, polygons), file.name)
 
 
 def checked_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndarray, np.ndarray]:
@@ -101,11 +102,61 @@ def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> Welded:
     return Welded(vertices[np.sort(first)], joined[~flat], index, int(flat.sum()))
 
 
-def _triangles(polygons: Polygons) -> np.ndarray:
-    """Faces as triangles: those of more corners as fans around their first."""
+def near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
+    """How many pieces, which share no vertex, come within a tenth of the shortest edge of another, and how near [m].
+
+    (0, inf) where none do. Such a mesh is most often one whose vertices were rounded differently from face to face.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    ends = np.stack([faces.ravel(), np.roll(faces, 1, axis=1).ravel()])
+    _, piece = connected_components(coo_array((np.ones(ends.shape[1]), ends), (len(vertices),) * 2), directed=False)
+    if not piece[faces].any():
+        return 0, np.inf
+    edges = np.sqrt(((vertices[ends[0]] - vertices[ends[1]]) ** 2).sum(axis=-1))
+    pairs = KDTree(vertices).query_pairs(edges.min() / 10, output_type="ndarray")
+    pairs = pairs[piece[pairs[:, 0]] != piece[pairs[:, 1]]]
+    if not len(pairs):
+        return 0, np.inf
+    apart = np.sqrt(((vertices[pairs[:, 0]] - vertices[pairs[:, 1]]) ** 2).sum(axis=-1))
+    return len(np.unique(piece[pairs])), float(apart.max())
+
+
+def _triangles(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndarray:
+    """Faces as triangles: those of more corners as fans around their first corner that sees all the others."""
     if all(len(polygon) == 3 for polygon in polygons):
         return np.array(polygons, np.int64)
-    return np.array([(p[0], p[i], p[i + 1]) for p in polygons for i in range(1, len(p) - 1)], np.int64)
+    lengths, fans = np.array([len(polygon) for polygon in polygons]), list(polygons)
+    for length in np.unique(lengths[lengths > 3]):
+        which = np.flatnonzero(lengths == length)
+        corners = np.array([polygons[i] for i in which], np.int64)
+        known = ((corners >= 0) & (corners < len(vertices))).all(
+            axis=1
+        )  # others are refused with triangles of their kind
+        begun = _fan_starts(vertices[corners[known]])
+        if (begun < 0).any():
+            first = which[known][int(np.argmax(begun < 0))]
+            raise ValueError(
+                f"{name}: face {first} has no corner that sees all its others, expected a fan. Triangulate the mesh first."
+            )
+        for i, polygon, start in zip(which[known], corners[known], begun, strict=True):
+            fans[i] = np.roll(polygon, -start)
+    return np.array([(p[0], p[i], p[i + 1]) for p in fans for i in range(1, len(p) - 1)], np.int64)
+
+
+def _fan_starts(places: np.ndarray) -> np.ndarray:
+    """The first corner of each polygon `(polygons, corners, 3)` whose fan has no triangle turned over; -1 without one."""
+    away = places - places[:, :1]
+    normal = np.cross(away, np.roll(away, -1, axis=1)).sum(axis=1)
+    least = -1e-6 * (normal**2).sum(axis=1)  # of four corners in a line, by rounding
+    starts = np.full(len(places), -1)
+    for start in reversed(range(places.shape[1])):
+        away = np.roll(places, -start, axis=1)[:, 1:] - places[:, start, None]
+        along = (np.cross(away[:, :-1], away[:, 1:]) * normal[:, None]).sum(axis=-1)
+        starts[(along >= least[:, None]).all(axis=1)] = start
+    return starts
 
 
 def _read_with_trimesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -132,9 +183,11 @@ def _demand_whole_stl(file: Path) -> None:
     told = int.from_bytes(content[80:84], "little")
     if len(content) == 84 + 50 * told:
         return
-    words = re.findall(rb"\b(endfacet|vertex|endsolid|facet)\b", content)
+    # a solid may have any name
+    unnamed = re.sub(rb"(?m)^([ \t]*(?:end)?solid)\b(?!.*\bfacet\s+normal\b).*", rb"\1", content.lower())
+    words = re.findall(rb"\b(endfacet|vertex|endsolid|facet|solid)\b", unnamed)
     facets, corners = words.count(b"facet"), words.count(b"vertex")
-    if not content.lstrip().startswith(b"solid") or words[-1:] != [b"endsolid"] or corners != 3 * facets:
+    if words[:1] != [b"solid"] or words[-1:] != [b"endsolid"] or corners != 3 * facets:
         raise ValueError(
             f"{file.name}: is not an STL file, or truncated: as a binary one it has {len(content)} bytes and says {told} "
             f"triangles, as text it has {facets} facets with {corners} vertices."

@@ -264,3 +264,50 @@ def test_without_trimesh_its_files_say_what_is_missing(tmp_path, monkeypatch):
     (tmp_path / "a.stl").write_text("solid\nendsolid\n")
     with pytest.raises(ImportError, match=r"a.stl needs trimesh: pip install 'physjax\[mesh\]'"):
         read_mesh(tmp_path / "a.stl")
+
+
+DART = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [1.8, 0.2, 0.0]])
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_a_hollow_quad_keeps_its_area_whichever_corner_comes_first(turn, tmp_path):
+    lines = "".join("v {:g} {:g} {:g}\n".format(*corner) for corner in np.roll(DART, turn, axis=0))
+    (tmp_path / "a.obj").write_text(lines + "f 1 2 3 4\n")
+    vertices, faces = read_mesh(tmp_path / "a.obj", triangulate=True)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    np.testing.assert_allclose(np.cross(b - a, c - a)[:, 2].sum() / 2, 0.4)
+    np.testing.assert_allclose(np.abs(np.cross(b - a, c - a)[:, 2]).sum() / 2, 0.4)
+
+
+def test_a_star_that_no_fan_covers_is_refused(tmp_path):
+    angle = np.arange(10) * np.pi / 5
+    star = np.stack([np.cos(angle), np.sin(angle)], -1) * np.where(np.arange(10) % 2, 0.2, 1.0)[:, None]
+    lines = "".join(f"v {x:g} {y:g} 0\n" for x, y in star)
+    (tmp_path / "a.obj").write_text(lines + "f 1 2 3 4 5 6 7 8 9 10\n")
+    with pytest.raises(ValueError, match=r"a.obj: face 0 has no corner that sees all its others.* Triangulate"):
+        read_mesh(tmp_path / "a.obj", triangulate=True)
+
+
+def test_pieces_that_were_rounded_apart_are_warned_of():
+    quads = np.array([CORNERS, CORNERS + np.array([1, 1e-4, 0])]).reshape(-1, 3)
+    faces = np.array([*SQUARE, *(np.array(SQUARE) + 4)])
+    with pytest.warns(UserWarning, match=r"2 pieces of the mesh share no vertex.* within 0.0001 m.* weld=0.000101"):
+        lattices.from_mesh(quads, faces, mass=1.0, structural=1.0)
+    with pytest.warns(UserWarning, match=r"8 vertices stand in 6 places"):
+        assert lattices.from_mesh(quads, faces, mass=1.0, structural=1.0, weld=1.01e-4).state.position.shape == (
+            6,
+            3,
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lattices.from_mesh(quads, faces, mass=1.0, structural=1.0, weld=0)
+        lattices.from_mesh(quads + 5 * (np.arange(8) > 3)[:, None], faces, mass=1.0, structural=1.0)
+
+
+@pytest.mark.parametrize("name", ["x", "facet vertex", ""])
+@pytest.mark.parametrize("change", [str, str.upper, lambda text: text.replace("\n", "\r\n")])
+def test_text_stl_is_read_whatever_its_name_and_case(name, change, tmp_path):
+    facet = lambda face: "".join("vertex {:g} {:g} {:g}\n".format(*CORNERS[i]) for i in face)  # noqa: E731
+    facets = [f"facet normal 0 0 1\nouter loop\n{facet(face)}endloop\nendfacet\n" for face in SQUARE]
+    (tmp_path / "a.stl").write_bytes(change(f"solid {name}\n{''.join(facets)}endsolid {name}\n").encode())
+    assert read_mesh(tmp_path / "a.stl")[1].tolist() == SQUARE
