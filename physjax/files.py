@@ -98,7 +98,10 @@ def read_arrays(path: str | os.PathLike, writer: str) -> dict[str, np.ndarray]:
 
 def demand_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise a ValueError that names the file and the array which no run could have written."""
-    missing = {"time", "ok", "first_step", "save_every", "steps", "method"} - set(arrays)
+    needed = {"time", "ok", "first_step", "save_every", "steps", "method"}
+    if any(name.startswith(("final_state.", "first_bad_step")) for name in arrays):  # those of no reference solver
+        needed |= {"dt"}
+    missing = needed - set(arrays)
     if missing:
         raise ValueError(f"load: {file} is not a saved run: it lacks {', '.join(sorted(missing))}.")
 
@@ -156,10 +159,10 @@ def _demand_frames(arrays: Mapping[str, np.ndarray], demand: Any, frames: int) -
             demand(f"{group}.position", place.dtype.kind == "f", "real numbers")
             agree = (place.shape, place.dtype) == (speed.shape, speed.dtype)
             demand(f"{group}.velocity", agree, f"{place.dtype} of shape {place.shape}, as {group}.position")
-    if {"state.position", "final_state.position"} <= set(arrays):
-        last = np.moveaxis(arrays["state.position"], axis, 0)[-1]
-        same = np.array_equal(last, arrays["final_state.position"], equal_nan=True)
-        demand("final_state.position", same, "the position of the last frame")
+    for name in [name for name in arrays if name.startswith("final_state.") and name.removeprefix("final_") in arrays]:
+        last = np.moveaxis(arrays[name.removeprefix("final_")], axis, 0)[-1]
+        same = np.array_equal(last, arrays[name], equal_nan=last.dtype.kind in "fc")
+        demand(name, same, f"the {name.removeprefix('final_state.').replace('_', ' ')} of the last frame")
     if "state.position" in arrays:
         lanes = (*outside, *arrays["state.position"].shape[axis + 1 : -1])
         demand("ok", ok.shape in (lanes, lanes[:-1]), f"one for each lane or scene, {lanes}")

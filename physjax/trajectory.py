@@ -282,7 +282,9 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
         final_parts = _filled("final_parts", memories(scene), arrays, shaped=True)
         _demand_same_contacts(memories(scene), final_parts)
         final_scene = _remembering(scene, final_state, final_parts)
-        parts = () if recorded else _filled("parts", memories(scene), arrays)
+        if not recorded:
+            parts = _filled("parts", memories(scene), arrays, shaped=True)
+            _demand_same_contacts(memories(scene), parts)
     if not recorded:
         state = _filled("state", Particles(0, 0) if scene is None else scene.state, arrays)
     return cls(
@@ -329,7 +331,7 @@ def _demand_same_contacts(given: tuple, found: tuple) -> None:
 
 
 def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> Any:
-    """The pytree `like` with its leaves replaced by the file's arrays of that group, of the same shapes if so `shaped`."""
+    """The pytree `like` with its leaves replaced by that group of arrays, `shaped` as they are, of parts also with frames."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]
     # what rounding leaves out of a moment was nothing in files from before it was kept
@@ -340,8 +342,11 @@ def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped
         raise ValueError(
             f"load: the file lacks {missing[0]!r}, which the scene has. Give the scene the run was made with."
         )
+    over_time = lambda shape: (*arrays["time"].shape[: axis + 1], *shape[axis:])  # noqa: E731
+    axis = arrays["first_step"].ndim
     for name, (_, leaf) in zip(names, leaves, strict=True):
-        if shaped and (arrays[name].shape, arrays[name].dtype) != (jnp.shape(leaf), jnp.result_type(leaf)):
+        shapes = (jnp.shape(leaf), over_time(jnp.shape(leaf)) if group == "parts" else jnp.shape(leaf))
+        if shaped and (arrays[name].shape not in shapes or arrays[name].dtype != jnp.result_type(leaf)):
             raise ValueError(
                 f"load: {name}: the file has {arrays[name].dtype} of shape {arrays[name].shape}, the given scene "
                 f"{jnp.result_type(leaf)} of shape {jnp.shape(leaf)}. Give the scene the run was made with."

@@ -354,7 +354,10 @@ TAMPERED = {
     ],
     "state.velocity": [(lambda v: v[..., :1], r"float64 of shape \(7, 3, 2\), as state.position")],
     "final_state.position": [(lambda x: x + 1e-9, "the position of the last frame")],
-    "final_state.velocity": [(lambda v: v * np.nan, "finite numbers, since ok is true")],
+    "final_state.velocity": [
+        (lambda v: v * np.nan, "finite numbers, since ok is true"),
+        (lambda v: v + 1e-9, "the velocity of the last frame"),
+    ],
 }
 
 
@@ -382,6 +385,20 @@ def test_a_file_of_the_first_edition_is_read_and_a_memory_of_another_shape_is_no
         ValueError, match=r"final_parts\[0\]\.fuel: the file has float64 of shape \(2,\).* of shape \(3,\)"
     ):
         Trajectory.load(tmp_path / "old.npz", scene=flight.scene)
+
+
+def test_what_parts_remembered_at_frames_has_the_shape_and_type_of_the_scenes(flight, tmp_path):
+    flight.save(tmp_path / "run.npz")
+    arrays = dict(np.load(tmp_path / "run.npz"))
+    load = lambda: Trajectory.load(tmp_path / "other.npz", scene=flight.scene, method=methods.verlet)  # noqa: E731
+    for fuel in (np.ones((7, 2)), np.ones((6, 3)), arrays["parts[0].fuel"].astype(np.float16)):
+        np.savez(tmp_path / "other.npz", **arrays | {"parts[0].fuel": fuel})
+        with pytest.raises(ValueError, match=r"parts\[0\]\.fuel: the file has float"):
+            load()
+    del arrays["dt"]
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(ValueError, match=r"is not a saved run: it lacks dt\."):
+        load()
 
 
 def test_a_run_of_another_method_or_contact_is_refused(flight, tmp_path):
