@@ -427,7 +427,7 @@ def test_a_traced_number_beyond_its_bounds_is_a_status_of_its_lane(name, unannot
     np.testing.assert_allclose(ends[0], run(good).final_scene.state.position, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize("bad", ["life", "drag"])
+@pytest.mark.parametrize("bad", [pytest.param("life", marks=pytest.mark.slow), "drag"])
 def test_a_birth_does_not_put_right_what_a_traced_number_has_spoilt(bad):
     def run(q):
         life, drag = (q, 1.0) if bad == "life" else (1.0, jnp.stack([jnp.ones_like(q), q, jnp.ones_like(q)]))
