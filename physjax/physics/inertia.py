@@ -114,7 +114,10 @@ def box(mass: ArrayLike, size: ArrayLike) -> Inertia:
         >>> inertia.box(12.0, (1.0, 2.0, 3.0)).principal.tolist()
         [13.0, 10.0, 5.0]
     """
-    a, b, c = jnp.moveaxis(real_quantity("size [m]", size, above=0.0) ** 2, -1, 0)
+    size = real_quantity("size [m]", size, above=0.0)
+    if size.shape[-1:] != (3,):
+        raise ValueError(f"size [m]: got the shape {size.shape}, expected three edges, (3,) or (*lanes, 3).")
+    a, b, c = jnp.moveaxis(size**2, -1, 0)
     return _of_shape(mass, 1 / 12, b + c, c + a, a + b)
 
 

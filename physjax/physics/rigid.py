@@ -63,9 +63,9 @@ def bodies(
 ) -> RigidBodies:
     """Bodies that begin with these velocities: p = m v, L = R I Rᵀ ω.
 
-    Vectors are `(3,)` for all or one per lane, `(*lanes, 3)`, the orientation a quaternion of any length. The angular
-    velocity [rad/s] is in the `frame` of the "world" or the "body". On a pivot the velocity follows from it. The float
-    type is the position's.
+    Vectors are `(3,)` for all or one per lane, `(*lanes, 3)`; the orientation is a quaternion (w, x, y, z) of any length,
+    the real part first: (1, 0, 0, 0) is not turned. The angular velocity [rad/s] is in the `frame` of the "world" or the
+    "body". On a pivot the velocity follows from it. The float type is the position's.
 
     Example:
         >>> turning = rigid.bodies(brick, angular_velocity=(0.0, 0.0, 2.0))
