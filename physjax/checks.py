@@ -18,7 +18,9 @@ from jaxtyping import Array
 
 def concrete(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is being traced."""
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(jax.device_get(value))
+    if isinstance(value, jax.core.Tracer):
+        return None
+    return np.asarray(jax.device_get(value) if isinstance(value, jax.Array) else value)
 
 
 def real_array(name: str, value: Any) -> Array:

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import demand_legal
-from physjax.particles import Particles, added, demand_particles
+from physjax.particles import Particles, demand_particles
 from physjax.vectors import scale
 
 
@@ -62,11 +62,11 @@ class Force(eqx.Module):
         """Force on each lane [N]."""
 
     @property
-    def weight(self) -> tuple[Array | None, int] | None:
+    def weight(self) -> tuple[Any, int] | None:
         """g [m/s²] (None: not along an axis) and the axis that is up, of a force that is the weight; None of any other."""
         return None
 
-    def under(self, weight: tuple[Array | None, int]) -> "Force":
+    def under(self, weight: tuple[Any, int]) -> "Force":
         """The force in a scene with this weight: one that needs g and up takes them over, or refuses what it cannot."""
         return self
 
@@ -157,7 +157,7 @@ def under_one_gravity(forces: list, dim: int) -> tuple:
     if len(axes := {up for _, up in weights}) > 1:
         raise ValueError(f"forces: got Gravity along the axes {sorted(axes)}, expected one axis that is up for all.")
     known = [g for g, _ in weights if g is not None]
-    weight = (added(known) if len(known) == len(weights) else None, weights[0][1])
+    weight = (sum(known[1:], known[0]) if len(known) == len(weights) else None, weights[0][1])
     return tuple(force.under(weight) if isinstance(force, Force) else force for force in forces)
 
 

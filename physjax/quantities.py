@@ -85,6 +85,8 @@ def good_lanes(part: Any, lanes: tuple[int, ...], dim: int) -> list[Bool[Array, 
 
     A module may add relations between its numbers: `relations()` gives booleans, one for all lanes or one per lane.
     """
+    if not any(map(_is_traced, jax.tree.leaves(part))):
+        return []
     good = []
     for number in numbers(part)[0]:
         if number.quantity is not None and number.quantity.per != "memory" and _is_traced(number.value):
@@ -148,7 +150,9 @@ def _number(tree: Any, path: tuple, leaf: Any) -> Number:
     for key in path:
         name = getattr(key, "name", None)
         about = getattr(type(node), "__dataclass_fields__", {}).get(name) if isinstance(node, eqx.Module) else None
-        if about is not None and "record" not in about.metadata:
+        if about is not None and "record" in about.metadata:
+            owner, quantity = None, None
+        elif about is not None:
             owner, field = node, name
             quantity = about.metadata.get("quantity", quantity)
         node = _child(node, key)
@@ -194,5 +198,5 @@ def _advice(shape: tuple[int, ...], lanes: tuple[int, ...], own: tuple) -> str:
     if lanes and shape and len(shape) < len(lanes) and not own:
         return " Say which axis is meant: number[:, None] or number[None, :], broadcast to the lanes' shape."
     if not lanes and shape:
-        return " The state is a single particle without lanes; several are positions of shape (n, dim)."
+        return " The state is one particle or body without lanes; several are positions of shape (n, dim)."
     return ""

@@ -190,8 +190,8 @@ def test_forces_that_disagree_about_gravity_are_refused(parts):
 
 
 @pytest.mark.parametrize("angle", [45.0, -30.0, [0.5, 60.0]])
-def test_an_angle_in_degrees_is_refused(angle, unannotated):
-    with pytest.raises(ValueError, match=r"angle \[rad\]: got .* expected radians.*np.deg2rad"):
+def test_an_angle_in_degrees_is_told(angle, unannotated):
+    with pytest.warns(UserWarning, match=r"angle \[rad\]: got .* expected radians.*np.deg2rad"):
         projectile.horizontal_range(20.0, angle)
 
 

@@ -69,7 +69,7 @@ class Gravity(Field):
         return mass * self.g * state.position[..., self.up]
 
     @property
-    def weight(self) -> tuple[Array | None, int]:
+    def weight(self) -> tuple[Any, int]:
         """g [m/s²] and the axis that is up; of a slanting gravity no g."""
         return self.g, self.up
 
@@ -113,7 +113,7 @@ class Buoyancy(Force):
         """ρ_f V g along the upward axis [N]."""
         return upward(self.density * self._g * self.displaced(state), self._up, state.velocity)
 
-    def under(self, weight: tuple[Array | None, int]) -> "Buoyancy":
+    def under(self, weight: tuple[Any, int]) -> "Buoyancy":
         """The buoyancy under the scene's weight, whose g and axis it takes over; ValueError where it was told others."""
         g, up = weight
         given, scene = (None if a is None else concrete(a) for a in (self.g, g))

@@ -152,8 +152,10 @@ _INPUT_CURE = (
 
 def _starts_finite(scene: Scene, lane: int | tuple[int, ...] | None) -> bool:
     """Whether a scene, or one lane of it, starts with finite numbers."""
-    leaves = [np.asarray(leaf) if lane is None else np.asarray(leaf)[lane] for leaf in scene.state]
-    return all(np.isfinite(leaf).all() for leaf in leaves)
+    finite = np.asarray(scene.finite(scene.state))
+    index = () if lane is None else lane if isinstance(lane, tuple) else (lane,)
+    known = len(index) <= finite.ndim and all(0 <= i < n for i, n in zip(index, finite.shape, strict=False))
+    return not known or bool(finite[index].all())  # an index that is none is told by what looks for the lane
 
 
 def _alone(

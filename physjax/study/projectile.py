@@ -15,6 +15,7 @@ formula.
 """
 
 import math
+import warnings
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, real_array, real_quantity
+from physjax.checks import concrete, real_array, real_quantity
 from physjax.vectors import norm, square_root
 
 __all__ = [
@@ -263,6 +264,8 @@ def least_speed(distance: ArrayLike, rise: ArrayLike, *, g: ArrayLike = 9.8) -> 
 def _numbers(**given: ArrayLike) -> tuple[Array, ...]:
     """The numbers as arrays of one shape, bad ones refused where they are concrete and NaN where they are traced."""
     arrays = {name: _number(name, value) for name, value in given.items()}
+    if "angle" in arrays:
+        _warn_of_degrees(concrete(arrays["angle"]))
     try:
         return tuple(jnp.broadcast_arrays(*arrays.values()))  # a list in older versions
     except ValueError as error:
@@ -270,15 +273,18 @@ def _numbers(**given: ArrayLike) -> tuple[Array, ...]:
         raise ValueError(f"projectile: got {shapes}, expected shapes that broadcast together.") from error
 
 
+def _warn_of_degrees(angle: np.ndarray | None) -> None:
+    """Warn of an angle beyond a full turn, which is most often one in degrees."""
+    if angle is not None and np.any(np.abs(angle) > TURN):
+        worst = angle.flat[np.nanargmax(np.abs(angle))]
+        words = f"angle [rad]: got {worst:g}, more than a full turn; expected radians. For degrees use np.deg2rad."
+        warnings.warn(words, stacklevel=4)
+
+
 def _number(name: str, value: ArrayLike) -> Array:
     label = f"{name} [{_UNITS.get(name, 'm')}]"
     if name in ("angle", "t"):
-        array = real_array(label, value)
-        values = concrete(array)
-        if name == "angle" and values is not None:
-            turns = np.isnan(values) | (np.abs(values) <= TURN)
-            demand(label, array, turns, "radians, at most a full turn; for degrees use np.deg2rad")
-        return array
+        return real_array(label, value)
     if name not in ("speed", "g"):
         return real_quantity(label, value)
     array = real_quantity(label, value, above=0)

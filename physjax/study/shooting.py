@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from physjax.lanes import any_lane, loop, on_flagged
+from physjax.loops import RECORD
 from physjax.scene import Particles, Scene
 from physjax.stepping.simulate import sample, simulate
 from physjax.trajectory import Trajectory
@@ -43,8 +44,8 @@ class Launch(NamedTuple):
 class Range(eqx.Module):
     """Where shots are fired: a scene with a lane for every target [m], the method of the flights and their steps."""
 
-    scene: Scene
-    target: Float[Array, "*lanes dim"]
+    scene: Scene = eqx.field(metadata=RECORD)
+    target: Float[Array, "*lanes dim"] = eqx.field(metadata=RECORD)
     method: Any
     steps: int = eqx.field(static=True)
 

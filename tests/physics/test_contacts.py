@@ -208,7 +208,7 @@ def test_coupled_bodies_bounce_too():
         (lambda: contacts.Plane((0, 0), (0, 0)), "not zero"),
         (lambda: contacts.Plane((0, 0), (0, np.nan)), "finite"),
         (lambda: contacts.Plane((0, 0), (0, 1), restitution=1.1), "from 0 to 1"),
-        (lambda: contacts.Plane((0, 0), (0, 1), restitution=-0.1), ">= 0"),
+        (lambda: contacts.Plane((0, 0), (0, 1), restitution=-0.1), "from 0 to 1"),
         (lambda: contacts.Plane((0, 0), (0, 1), friction=2.0), "from 0 to 1"),
         (lambda: contacts.Plane((0, 0), (0, 1), friction=0.1, coulomb=contacts.Coulomb(1, 1)), "at most one"),
         (lambda: contacts.Plane(**FLOOR, response="impact"), "expected contacts.impact"),

@@ -284,7 +284,7 @@ def test_a_look_goes_by_the_share_of_life():
         ({"rate": None, "burst": 7, "every": 1.0}, "a divisor of the pool of 1200"),
         ({"direction": (0.0, 0.0, 0.0)}, "a vector that is not zero"),
         ({"opposed": True}, "expected bursts of an even number"),
-        ({"cone": 4.0}, "from 0 to π"),
+        ({"cone": 4.0}, "from 0 to 3.1416"),
         ({"life_spread": 1.0}, "below 1"),
     ],
 )

@@ -174,7 +174,7 @@ def test_gradients_through_an_impact_agree_with_differences(derivative):
             lambda: Scene(
                 RigidBodies(*dropped(floor()).state), BOX, contacts=(rigid.Touch(rigid.Hull(jnp.zeros((4, 2, 3))), floor()),)
             ),
-            "with these lanes in front",
+            r"expected a vector of shape \(n, 3\) for all lanes",
         ),
         (
             lambda: Scene(

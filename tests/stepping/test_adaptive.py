@@ -263,6 +263,7 @@ def test_a_force_of_ones_own_may_list_its_jumps_as_plain_numbers():
     assert float(run.position[-1, 0]) == pytest.approx(0.75**2, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_derivative_by_when_a_kick_comes_is_minus_its_velocity():
     def end(at, tries):
         scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(forces.Kick((2.0,), at=at, duration=0.01),))
