@@ -150,7 +150,7 @@ def under_one_gravity(forces: list, dim: int) -> tuple:
     for _, up in weights:
         if up >= dim:
             raise ValueError(
-                f"up: Gravity acts along the axis {up}, but places here have {dim} components, 0 to {dim - 1}."
+                f"up: got axis {up}, but places here have {dim} components. Give an axis from 0 to {dim - 1}."
             )
     if not weights:
         return tuple(forces)

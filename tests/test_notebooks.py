@@ -28,6 +28,7 @@ def test_a_committed_notebook_is_light_and_was_run(path):
     assert not complaints(cells)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
     notebook = nbformat.read(path, 4)
