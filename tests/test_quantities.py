@@ -153,8 +153,8 @@ def test_the_axis_that_is_up_is_the_one_a_gravity_vector_pulls_against(about, up
         (lambda: forces.Buoyancy(1.0, volume=1.0, up="z"), "got str 'z', expected an integer"),
         (lambda: forces.Gravity(5.0, vector=(0.0, -9.8)), "both g = 5.0 and a vector, expected one"),
         (lambda: forces.Gravity(up=2, vector=(0.0, -9.8, 0.0)), "up = 2, but a vector down the axis 1"),
-        (lambda: Scene(BALL, forces=(forces.Gravity(up=2),)), "along the axis 2, but places here have 2 components"),
-        (lambda: Scene(BALL, forces=(forces.Gravity(vector=(0.0, 0.0, -9.8)),)), "along the axis 2, but places here"),
+        (lambda: Scene(BALL, forces=(forces.Gravity(up=2),)), "got axis 2, but places here have 2 components"),
+        (lambda: Scene(BALL, forces=(forces.Gravity(vector=(0.0, 0.0, -9.8)),)), "got axis 2, but places here"),
     ],
 )
 def test_an_axis_or_a_gravity_that_cannot_be_is_refused_at_once(given, fault, unannotated):
