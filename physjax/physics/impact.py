@@ -168,7 +168,7 @@ def _leg(motion: Callable, scene: Scene, leg: _Leg, t: Time, dt: Array) -> _Leg:
         touched = begun + duration
         at = apart(meeting.hit, lambda: motion(held, begun, duration).state, leg.state)
         state, since = apart(
-            meeting.hit, lambda: _answer(held, start, meeting, touched, at, dt), (leg.state, leg.since)
+            meeting.hit, lambda: _answer(held, start, meeting, begun, touched, at, dt), (leg.state, leg.since)
         )
         return chosen(meeting.hit, _Leg(leg.elapsed + duration, state, since, leg.arrived), through)
 
@@ -220,11 +220,12 @@ def hair(dt: Array) -> Array:
 
 
 def _answer(
-    scene: Scene, start: Held, meeting: "_Meeting", t: Time, at: Particles, dt: Array
+    scene: Scene, start: Held, meeting: "_Meeting", begun: Time, t: Time, at: Particles, dt: Array
 ) -> tuple[Particles, tuple]:
     """State and memory after the touches: a bounce, coming to rest, or the end of a slide."""
     walls, acceleration, t = _walls(scene), scene.acceleration(t, at), now(t)
-    guards = jnp.stack(_guards(walls, start, meeting, t, at))
+    faces = _faces(walls, now(begun), start.state)
+    guards = jnp.stack(_guards(faces, walls, start, meeting, t, at))
     which = jnp.argmin(guards, axis=0)
     # a path that only just misses, though the cubic touched, goes on as it was
     eps = float(jnp.finfo(at.dtype).eps)
@@ -232,7 +233,7 @@ def _answer(
     touches = meeting.hit & (jnp.min(guards, axis=0) <= lax.stop_gradient(reached))
     state, since = at, list(start.since)
     # one guard a lane: each answer starts from the same state, and is taken where it applies
-    for i, wall in enumerate(_faces(walls, t, start.state)):
+    for i, wall in enumerate(faces):
         here = touches & (which == i)
         normal, relative = wall.outward(t, at.position), wall.relative(at.velocity)
         inward = jnp.where(here, jnp.minimum(dot(relative, normal), 0.0), 0.0)
@@ -323,9 +324,12 @@ def dip_of(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, end:
     return Dip(first, last, jnp.where(first > 0, cubic(first), d0), below)
 
 
-def _guards(walls: tuple, start: Held, meeting: _Meeting, t: ArrayLike, state: Particles) -> list[Array]:
-    """The guards of a leg at a moment; those not watched are infinite."""
-    values = [face.gap(t, state.position) for face in _faces(walls, t, start.state)]
+def _guards(faces: list, walls: tuple, start: Held, meeting: _Meeting, t: ArrayLike, state: Particles) -> list[Array]:
+    """The guards of a leg at a moment; those not watched are infinite. The faces are those seen when the leg begins.
+
+    Later a slab that moves may have gone past the place where the lane began.
+    """
+    values = [face.gap(t, state.position) for face in faces]
     for wall, slip in zip(walls, start.slip, strict=True):
         if slip is not None:
             values.append(dot(wall.relative(state.velocity), slip))
@@ -337,8 +341,9 @@ def _moment(motion: Callable, scene: Scene, start: Held, meeting: _Meeting, begu
     meeting, rest = lax.stop_gradient((meeting, rest))
 
     def nearest(duration, scene, start, meeting, begun):
-        state = motion(scene, begun, duration).state
-        return jnp.min(jnp.stack(_guards(_walls(scene), start, meeting, now(begun + duration), state)), axis=0)
+        state, walls = motion(scene, begun, duration).state, _walls(scene)
+        faces = _faces(walls, now(begun), start.state)
+        return jnp.min(jnp.stack(_guards(faces, walls, start, meeting, now(begun + duration), state)), axis=0)
 
     bracket = (meeting.first * rest, jnp.minimum(meeting.last, 1.0) * rest)
     tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest

@@ -297,3 +297,13 @@ def test_a_ball_between_closing_walls_is_where_its_bounces_take_it():
         x, t = x + hit * v, t + hit
         v = -v - 2 * CLOSING if v > 0 else -v
     assert float(run.position[18, 0, 0]) == pytest.approx(x + v * (end - t), abs=1e-9)
+
+
+def test_a_slab_that_comes_over_the_place_where_a_ball_rests_is_met_by_the_face_it_came_with():
+    slab = contacts.Slab((0.0, 0.0), (-1.0, 0.3), thickness=0.2, restitution=0.8, velocity=(-50.0, 0.0))
+    height = np.linspace(-0.6, 0.6, 64)
+    place = np.stack([-3.0 - np.linspace(0.0, 1.0, 64) ** 2, height], axis=-1)
+    scene = Scene(Particles(jnp.asarray(place), jnp.zeros((64, 2))), contacts=(slab,))
+    end = simulate(scene, methods.semi_implicit_euler, dt=0.01, steps=16, save_every=16).velocity[-1]
+    normal = np.array([-1.0, 0.3]) / np.hypot(1.0, 0.3)
+    np.testing.assert_allclose(end, np.broadcast_to(1.8 * 50.0 / np.hypot(1.0, 0.3) * normal, (64, 2)), rtol=1e-9)
