@@ -32,11 +32,6 @@ KNOWN = (
 )  # fmt: skip
 
 
-def vectors_of(part: Any) -> set[str]:
-    """Names of those fields of a force or contact that are vectors (an axis upward is but a number)."""
-    return set(KINDS | MORE.get(type(part), {})) - {"up"}
-
-
 def flattened(scene: Scene, flight: Any) -> tuple[Scene, Any] | str:
     """The scene without the axis along which nothing moves, with what gives its states that axis back; or why there is none."""
     if not isinstance(scene.state, Particles) or scene.led is not None:
