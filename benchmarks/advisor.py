@@ -35,13 +35,12 @@ from physjax import methods
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
 from physjax.stepping.reference import discontinuities, in_dtype, ode_term
-from physjax.study import norms
-from physjax.study.accuracy import recommend
+from physjax.study.accuracy import error_measures, recommend
+from physjax.study.accuracy.method_facts import contender, copies, smallest_size
+from physjax.study.accuracy.recommend import candidates
+from physjax.study.accuracy.reference_solution import yardstick
+from physjax.study.accuracy.search import Question, explored, timed_in_turn
 from physjax.study.problem import Problem
-from physjax.study.recommend import candidates
-from physjax.study.running import contender, copies, smallest_size
-from physjax.study.search import Question, explored, timed_in_turn
-from physjax.study.yardstick import yardstick
 
 ERRORS = (1e-2, 1e-4, 1e-6)
 RANDOM = 40
@@ -92,7 +91,7 @@ def exhaustive(problem, answers):
         entries = candidates(problem.scene)[:3]
     slowest = max((a.best.seconds * problem.duration for a in answers if a.ok), default=0.1)
     truth = yardstick(problem._replace(exact=None), wanted=min(ERRORS))
-    question = Question(problem, truth, norms.path, None, None, time.process_time() + 30)
+    question = Question(problem, truth, error_measures.path, None, None, time.process_time() + 30)
     runs = []
     for method in entries:
         entry = contender(problem, method)
@@ -108,7 +107,7 @@ def judged(problem, other, doubt, advice, runs):
     if not advice.ok:
         return row
     best = advice.best
-    found = norms.path.error(other.scene, other.times, advice.simulate().state, other.states)
+    found = error_measures.path.error(other.scene, other.times, advice.simulate().state, other.states)
     row |= {"method": best.name, "dtype": best.dtype, "step": best.step, "promised": best.error, "found": found}
     row |= {"checked": doubt < 0.2 * advice.error, "kept": bool(found <= advice.error + doubt)}
     good = [(entry, trial) for entry, trial in runs if trial.error <= advice.error]
@@ -199,7 +198,7 @@ def rival_runs(single, many, truth, solver):
         size = smallest_size(single)
         run = partial(solved, single, many.scene.state, many.duration, tol, size, solver, many.frames)
         states = jax.tree.map(np.asarray, run())
-        error = norms.path.error(truth.scene, truth.times, states, truth.states)
+        error = error_measures.path.error(truth.scene, truth.times, states, truth.states)
         seconds = harness.stopwatch(run)
         if seconds < SLOW:
             seconds = min(seconds, *(harness.stopwatch(run) for _ in range(2)))

@@ -22,8 +22,7 @@ import numpy as np
 import optimistix
 from harness import Bar, tell
 
-from physjax import Particles, Scene, aim_at, forces, methods, ode_term, simulate, solve
-from physjax.study import projectile
+from physjax import Particles, Scene, aim_at, forces, methods, ode_term, projectile, simulate, solve
 
 SPEED, MASS, STEPS = 40.0, 0.145, 200
 OURS, OTHER, PLAIN = harness.COLOURS  # families by colour only

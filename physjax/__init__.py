@@ -28,25 +28,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from physjax.checks import quantity
+from physjax.particles import Particles
+from physjax.parts import Contact, Field, Force
 from physjax.physics import forces
 from physjax.pins import Pins
-from physjax.scene import Contact, Field, Force, Particles, Scene, loads
+from physjax.scene import Scene, loads
 from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
 from physjax.stepping.simulate import simulate, state_after
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from physjax import scenes
-    from physjax.physics import contacts, emitters, fields, inertia, lattices, rigid, springs
-    from physjax.physics.inertia import Inertia
-    from physjax.physics.rigid import RigidBodies
+    from physjax import projectile, scenes
+    from physjax.physics import contacts, emitters, rigid, springs
+    from physjax.physics.forces import flows as fields
+    from physjax.physics.rigid import inertia
+    from physjax.physics.rigid.inertia import Inertia
+    from physjax.physics.rigid.spatial import RigidBodies
+    from physjax.physics.springs import lattices
     from physjax.show import animate, export, plot
-    from physjax.study import accuracy, energy, gradients, projectile, stability
-    from physjax.study.aim import aim_at
-    from physjax.study.fit import fit
-    from physjax.study.solve import minimise, solve
-    from physjax.study.sweep import sweep
+    from physjax.study import accuracy, energy, stability
+    from physjax.study.inverse import gradients
+    from physjax.study.inverse.aim import aim_at
+    from physjax.study.inverse.fit import fit
+    from physjax.study.inverse.solve import minimise, solve
+    from physjax.study.sweeps.sweep import sweep
 
 __all__ = [
     "Contact",
@@ -92,29 +98,29 @@ __version__ = "0.1.0"
 
 # loaded when first named: what not every run needs should not make `import physjax` slower
 _LATER = {
-    "Inertia": "physjax.physics.inertia:Inertia",
+    "Inertia": "physjax.physics.rigid.inertia:Inertia",
     "RigidBodies": "physjax.physics.rigid:RigidBodies",
     "accuracy": "physjax.study.accuracy",
-    "aim_at": "physjax.study.aim:aim_at",
+    "aim_at": "physjax.study.inverse.aim:aim_at",
     "animate": "physjax.show.animate",
     "contacts": "physjax.physics.contacts",
     "emitters": "physjax.physics.emitters",
     "energy": "physjax.study.energy",
     "export": "physjax.show.export",
-    "fields": "physjax.physics.fields",
-    "fit": "physjax.study.fit:fit",
-    "gradients": "physjax.study.gradients",
-    "inertia": "physjax.physics.inertia",
-    "lattices": "physjax.physics.lattices",
-    "minimise": "physjax.study.solve:minimise",
+    "fields": "physjax.physics.forces.flows",
+    "fit": "physjax.study.inverse.fit:fit",
+    "gradients": "physjax.study.inverse.gradients",
+    "inertia": "physjax.physics.rigid.inertia",
+    "lattices": "physjax.physics.springs.lattices",
+    "minimise": "physjax.study.inverse.solve:minimise",
     "plot": "physjax.show.plot",
-    "projectile": "physjax.study.projectile",
+    "projectile": "physjax.projectile",
     "rigid": "physjax.physics.rigid",
     "scenes": "physjax.scenes",
-    "solve": "physjax.study.solve:solve",
+    "solve": "physjax.study.inverse.solve:solve",
     "springs": "physjax.physics.springs",
     "stability": "physjax.study.stability",
-    "sweep": "physjax.study.sweep:sweep",
+    "sweep": "physjax.study.sweeps.sweep:sweep",
 }
 
 

@@ -94,7 +94,7 @@ def _scenes(names: list[str], out: str | None) -> int:
     from physjax.checks import known
     from physjax.scenes import FAILURES, SCENES, title
     from physjax.scenes.catalogue import entry
-    from physjax.show.report import table
+    from physjax.text import table
 
     chosen = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(SCENES)
     if out is not None:
@@ -135,7 +135,7 @@ def _chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
     from physjax.checks import known
     from physjax.files import replacing, writable_folder
     from physjax.scenes import SCENES
-    from physjax.show import report
+    from physjax.study import report_page
 
     names = [known("scene", name, SCENES) for name in dict.fromkeys(names)] or _smooth()
     folder = writable_folder(out)
@@ -145,9 +145,9 @@ def _chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
     results = [_study(name, folder, quick) for name in names]
     summary = _summary([result for result, _ in results])
     with replacing(folder / "index.html") as file:
-        file.write(report.page("physjax: speed against accuracy", summary, [section for _, section in results]))
+        file.write(report_page.page("physjax: speed against accuracy", summary, [section for _, section in results]))
     print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
-    print(f"Measured on {report.machine()}.\nCharts: {folder / 'index.html'}")
+    print(f"Measured on {report_page.machine()}.\nCharts: {folder / 'index.html'}")
 
 
 def _smooth() -> list[str]:
@@ -166,7 +166,7 @@ def _reported(names: list[str], folder: Path) -> None:
 
     from physjax.files import replacing
     from physjax.scenes import SCENES, title
-    from physjax.show.report import page
+    from physjax.study.report_page import page
     from physjax.study.scene_report import PARTS, sections
 
     for name in names:
@@ -191,11 +191,11 @@ def _stability(name: str, out: str, steps: int) -> None:
     from physjax.checks import known, positive_integer
     from physjax.files import replacing, writable_folder
     from physjax.scenes import FAILURES, SCENES
-    from physjax.show.report import machine, seconds_text, table
     from physjax.stepping.methods import METHODS
+    from physjax.stepping.registry import method_name
     from physjax.study import stability
-    from physjax.study.limits import name_of
-    from physjax.study.survey import fastest_moment, map_around
+    from physjax.study.stability.survey import fastest_moment, map_around
+    from physjax.text import machine, seconds_text, table
 
     name, steps = known("scene", name, SCENES | FAILURES), positive_integer("steps", steps, at_least=64)
     folder = writable_folder(out)
@@ -233,12 +233,12 @@ def _stability(name: str, out: str, steps: int) -> None:
         print("No method has a limit here, so there is no map to draw.")
     if name in FAILURES:
         told = stability.explain(scene, problem.method, problem.dt, steps=problem.steps)
-        print(f"{name_of(problem.method)} with dt = {seconds_text(problem.dt)}: {told}")
+        print(f"{method_name(problem.method)} with dt = {seconds_text(problem.dt)}: {told}")
     print(f"Measured on {machine()}.")
 
 
 def _limit_texts(predicted: float, measured: float | None) -> list[str]:
-    from physjax.show.report import seconds_text
+    from physjax.text import seconds_text
 
     if not predicted or predicted == float("inf"):
         return ["none" if predicted else "never stable", "-"]
@@ -252,8 +252,8 @@ def _aim(options: argparse.Namespace) -> None:
     import numpy as np
 
     from physjax.files import replacing, writable_folder
-    from physjax.show.report import table
-    from physjax.study.aim import aim_at
+    from physjax.study.inverse.aim import aim_at
+    from physjax.text import table
 
     with jax.enable_x64(True):
         scene = _thrown(options)
@@ -283,8 +283,9 @@ def _aim(options: argparse.Namespace) -> None:
 
 def _thrown(options: argparse.Namespace):
     """The scene of `physjax aim`."""
+    from physjax.particles import Particles
     from physjax.physics import forces
-    from physjax.scene import Particles, Scene
+    from physjax.scene import Scene
 
     dim = len(options.target)
     start = options.start or [0.0] * dim
@@ -310,7 +311,7 @@ def _sweep(options: argparse.Namespace) -> None:
     from physjax.files import replacing, writable_folder
     from physjax.scenes import SCENES
     from physjax.stepping.methods import METHODS
-    from physjax.study.outcomes import OUTCOMES, swept_scene
+    from physjax.study.sweeps.observables import OUTCOMES, swept_scene
 
     build, outcome = SCENES[known("scene", options.scene, SCENES)], known("outcome", options.outcome, OUTCOMES)
     method = METHODS[known("method", options.method, METHODS)]
@@ -352,9 +353,9 @@ def _study(name: str, folder: Path, quick: bool):
 
     from physjax.files import replacing
     from physjax.scenes import SCENES, title
-    from physjax.show.report import Section, Table, drawn
     from physjax.stepping.methods import METHODS
     from physjax.study import accuracy
+    from physjax.study.report_page import Section, Table, drawn
 
     with jax.enable_x64(True):
         problem = SCENES[name]()
@@ -377,8 +378,8 @@ def _study(name: str, folder: Path, quick: bool):
 
 def _summary(results: list) -> str:
     """A line for each scene: the fastest method, its step and time, for each of the errors."""
-    from physjax.show.report import table
-    from physjax.study.work_precision import ERRORS
+    from physjax.study.accuracy.result import ERRORS
+    from physjax.text import table
 
     headers = ["scene", *(f"error {error:.0e}" for error in ERRORS), "truth"]
     rows = [[r.name, *(_fastest(r, error) for error in ERRORS), r.truth] for r in results]
@@ -386,7 +387,7 @@ def _summary(results: list) -> str:
 
 
 def _fastest(result, error: float) -> str:
-    from physjax.show.report import seconds_text
+    from physjax.text import seconds_text
 
     run = result.fastest(error)
     if run is None:

@@ -16,13 +16,13 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from physjax.backend import any_lane
 from physjax.checks import quantity
 from physjax.closures import warn_of_remade
-from physjax.lanes import any_lane, wide
 from physjax.loops import Moment, moment_at, now, repeat
-from physjax.particles import demand_particles
+from physjax.particles import demand_particles, wide
+from physjax.parts import as_module
 from physjax.roots import first_root
-from physjax.scene import as_module
 from physjax.vectors import norm
 
 TOGETHER = 64

@@ -208,3 +208,8 @@ def _demand_array(part: Any, path: tuple, leaf: Any) -> None:
         f"{name}: the field {field} holds a {kind}, expected an array or a float. What is no number is a part of the "
         "program: declare it with eqx.field(static=True)."
     )
+
+
+def force_name(force: Any) -> str:
+    """What a force is called in sentences: its class, or the name of the function that it is."""
+    return getattr(getattr(force, "function", force), "__name__", type(force).__name__)

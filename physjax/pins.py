@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete, declared
 from physjax.particles import Particles, demand_particles
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.vectors import components, stacked
 
 

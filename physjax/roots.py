@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from physjax.lanes import any_lane, apart, loop
+from physjax.backend import any_lane, apart, loop
 
 
 def first_root(function: Callable, arguments: tuple, search: tuple) -> Array:

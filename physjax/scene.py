@@ -17,7 +17,7 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.lanes import WHOLE, kept_apart
+from physjax.backend import WHOLE, kept_apart
 from physjax.loops import RECORD, Time, at_now, is_ours, now, told, told_method
 from physjax.particles import Particles, added, shaped
 from physjax.parts import (
@@ -160,6 +160,16 @@ class Scene(eqx.Module):
     def lane_mask(self, tree: Any) -> Any:
         """The tree with True in place of each array that has an entry for each lane of this scene, False elsewhere."""
         return lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a force remembers: springs that break."""
+        return any(hasattr(force, "advance") for force in self.forces)
+
+    @property
+    def resolves_at_step_end(self) -> bool:
+        """Whether something that happens within a step is seen at its end: a projected contact, a spring that breaks."""
+        return self.remembers or any((contact.response or project) is project for contact in self.contacts)
 
     @property
     def status_shape(self) -> tuple[int, ...]:

@@ -15,7 +15,9 @@ from physjax.checks import concrete
 from physjax.crossing import Crossing, first_crossing
 from physjax.files import RUN_FORMAT, demand_run, read_arrays, replacing
 from physjax.loops import moment_at
-from physjax.scene import Contact, Function, Particles, Scene, as_module, changes
+from physjax.particles import Particles
+from physjax.parts import Contact, Function, as_module, changes
+from physjax.scene import Scene
 
 
 class Trajectory(eqx.Module):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, Trajectory, contacts, forces, methods, reference, simulate
-from physjax.study.outcomes import height
+from physjax.study.sweeps.observables import height
 from physjax.vectors import scale, upward
 
 SPEEDS = np.array([[10.0, 12.0], [3.0, 14.0], [20.0, 8.0]])

@@ -23,7 +23,8 @@ from physjax import (
     springs,
     stability,
 )
-from physjax.physics import fields, inertia
+from physjax.physics.forces import flows
+from physjax.physics.rigid import inertia
 from physjax.stepping.blocks import FEWEST_STEPS, SMALLEST, Blocks
 
 BALL = Particles(jnp.array([0.0, 1.0]), jnp.array([3.0, 4.0]))
@@ -50,8 +51,8 @@ NUMBERS = {
     "omega_rate": lambda n: forces.RotatingFrame(1.0, n),
     "g": lambda n: forces.Gravity(n),
     "duration": lambda n: forces.Control([[1.0, 0.0]], n),
-    "circulation": lambda n: fields.Vortex(1.0, n, 0.1, (0.0, 0.0)),
-    "strength μ": lambda n: fields.Attractor(n, 0.1, (0.0, 0.0)),
+    "circulation": lambda n: flows.Vortex(1.0, n, 0.1, (0.0, 0.0)),
+    "strength μ": lambda n: flows.Attractor(n, 0.1, (0.0, 0.0)),
 }
 PLANE = ((0.0, 0.0), (0.0, 1.0))
 SURFACES = {
@@ -292,7 +293,7 @@ def test_lanes_are_cut_by_what_is_declared_and_stay_together_where_nothing_is():
 def test_one_lane_of_two_keeps_a_vector_of_two_components_whole():
     state = Particles(jnp.array([[1.0, 0.0], [3.0, 0.0]]), jnp.zeros((2, 2)))
     scene = Scene(
-        state, forces=(forces.Anchor((0.5, 0.25), np.array([1.0, 1e4])), fields.Vortex(0.1, 1.0, 1.0, (0.5, 0.25)))
+        state, forces=(forces.Anchor((0.5, 0.25), np.array([1.0, 1e4])), flows.Vortex(0.1, 1.0, 1.0, (0.5, 0.25)))
     )
     told = stability.explain(scene, methods.verlet, 0.1, steps=12, lane=1)
     np.testing.assert_allclose(abs(told.rate), 100.0, rtol=1e-2)

@@ -3,9 +3,13 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
-from physjax.scenes.gallery import FAILURES, SCENES, failure, scene, title
+from physjax.scenes.registry import FAILURES, SCENES, failure, scene, title
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 
 __all__ = ["FAILURES", "SCENES", "failure", "scene", "title"]
+
+
+def __dir__() -> list[str]:
+    return __all__

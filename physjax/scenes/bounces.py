@@ -8,10 +8,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from physjax.particles import Particles
 from physjax.physics import contacts, forces
-from physjax.scene import Particles, Scene
-from physjax.scenes.gallery import scene
-from physjax.study.energy import ENERGY
+from physjax.scene import Scene
+from physjax.scenes.registry import scene
+from physjax.study.energy.quantities import ENERGY
 from physjax.study.problem import Problem, Truth
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
 
-from physjax.physics.springs import Springs
-from physjax.scenes.gallery import SCENES, title
+from physjax.physics.springs.springs import Springs
+from physjax.scenes.registry import SCENES, title
 from physjax.study.problem import Problem
 
 
@@ -63,21 +63,21 @@ def _draw(name: str, folder: Path) -> Entry:
     from matplotlib import pyplot as plt
 
     from physjax.files import replacing
-    from physjax.show import portrait
+    from physjax.show import auto_plot
 
     told, problem = entry(name)
     run = problem.filmed()
-    figure = portrait.still(run, problem.looks)
+    figure = auto_plot.still(run, problem.looks)
     with replacing(folder / f"{name}.png", "wb") as file:
         figure.savefig(file, dpi=125, bbox_inches="tight")
     plt.close(figure)
-    portrait.moving(run, problem.looks).save(folder / f"{name}.gif", progress=False)
+    auto_plot.moving(run, problem.looks).save(folder / f"{name}.gif", progress=False)
     return told
 
 
 def _size(problem: Problem) -> str:
     """How many of what, in how many dimensions, and for how long."""
-    from physjax.show.report import seconds_text
+    from physjax.text import seconds_text
 
     state, forces = problem.scene.state, problem.scene.forces
     lanes = state.position[..., 0].size

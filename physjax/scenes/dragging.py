@@ -9,9 +9,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import quantity
-from physjax.physics import contacts, forces, inertia, rigid
-from physjax.scene import Force, Particles, Scene
-from physjax.scenes.gallery import scene
+from physjax.particles import Particles
+from physjax.parts import Force
+from physjax.physics import contacts, forces, rigid
+from physjax.physics.rigid import inertia
+from physjax.scene import Scene
+from physjax.scenes.registry import scene
 from physjax.show import solids
 from physjax.study.problem import Problem, Truth
 from physjax.vectors import over, scale

@@ -9,11 +9,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import quantity
-from physjax.physics import contacts, forces, inertia, rigid
-from physjax.physics.bodies import in_world
-from physjax.physics.inertia import Inertia
+from physjax.physics import contacts, forces, rigid
+from physjax.physics.rigid import inertia
+from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.spatial import in_world
 from physjax.scene import Scene
-from physjax.scenes.gallery import scene
+from physjax.scenes.registry import scene
 from physjax.show import solids
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory

@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics import forces, lattices
-from physjax.scene import Particles, Scene
-from physjax.scenes.gallery import failure
+from physjax.particles import Particles
+from physjax.physics import forces
+from physjax.physics.springs import lattices
+from physjax.scene import Scene
 from physjax.scenes.orbits import kepler
+from physjax.scenes.registry import failure
 from physjax.stepping import methods
 from physjax.stepping.simulate import simulate
 from physjax.trajectory import Trajectory

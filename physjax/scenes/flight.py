@@ -3,11 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 
+from physjax import projectile as closed_form
+from physjax.particles import Particles
 from physjax.physics import forces
-from physjax.scene import Particles, Scene
-from physjax.scenes.gallery import scene, table
-from physjax.study import projectile as closed_form
-from physjax.study.energy import ENERGY
+from physjax.scene import Scene
+from physjax.scenes.registry import scene, table
+from physjax.study.energy.quantities import ENERGY
 from physjax.study.problem import Problem, Truth
 
 

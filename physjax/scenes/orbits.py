@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
+from physjax.particles import Particles
 from physjax.physics import forces
-from physjax.scene import Particles, Scene
-from physjax.scenes.gallery import scene, table
-from physjax.study.energy import ANGULAR_MOMENTUM, ENERGY, MOMENTUM
+from physjax.scene import Scene
+from physjax.scenes.registry import scene, table
+from physjax.study.energy.quantities import ANGULAR_MOMENTUM, ENERGY, MOMENTUM
 from physjax.study.problem import Problem, Truth
 
 CONSERVED = (ENERGY, MOMENTUM, ANGULAR_MOMENTUM)

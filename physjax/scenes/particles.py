@@ -6,9 +6,10 @@ Each particle is compared with the closed form of its own birth, which the emitt
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics import contacts, emitters, fields, forces
+from physjax.physics import contacts, emitters, forces
+from physjax.physics.forces import flows
 from physjax.scene import Scene
-from physjax.scenes.gallery import scene
+from physjax.scenes.registry import scene
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
 
@@ -234,7 +235,7 @@ def _hot_gas(emitter: emitters.Emitter, rise: float, lag: float, eddies: float, 
     drag = mass / lag
     # Archimedes carries the weight and what the drag takes at the terminal speed
     volume = (mass * g + drag * rise) / (1.225 * g)
-    stirring = fields.Turbulence(drag, eddies, width, key=5)
+    stirring = flows.Turbulence(drag, eddies, width, key=5)
     loads = (forces.Gravity(g), forces.Buoyancy(1.225, volume), forces.StokesDrag(drag), stirring)
 
     def rising(flight):

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics import forces, inertia, rigid
+from physjax.physics import forces, rigid
+from physjax.physics.rigid import inertia
 from physjax.scene import Scene
-from physjax.scenes.gallery import scene
+from physjax.scenes.registry import scene
 from physjax.show import solids
-from physjax.study.energy import ANGULAR_MOMENTUM, ENERGY
+from physjax.study.energy.quantities import ANGULAR_MOMENTUM, ENERGY
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
 from physjax.vectors import composed, turn, turn_back, turned

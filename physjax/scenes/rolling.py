@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics import contacts, forces, inertia, rigid
+from physjax.physics import contacts, forces, rigid
+from physjax.physics.rigid import inertia
 from physjax.scene import Scene
-from physjax.scenes.gallery import scene
+from physjax.scenes.registry import scene
 from physjax.show import solids
 from physjax.study import energy
 from physjax.study.problem import Problem, Truth

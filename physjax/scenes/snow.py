@@ -6,9 +6,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import quantity
+from physjax.particles import Particles
 from physjax.physics import contacts, forces
-from physjax.scene import Particles, Scene
-from physjax.scenes.gallery import scene
+from physjax.scene import Scene
+from physjax.scenes.registry import scene
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
 from physjax.vectors import stacked

@@ -6,9 +6,10 @@ A ball is a particle: contacts act on its centre, a radius before what is seen, 
 import jax.numpy as jnp
 import numpy as np
 
+from physjax.particles import Particles
 from physjax.physics import contacts, forces
-from physjax.scene import Particles, Scene
-from physjax.scenes.gallery import scene
+from physjax.scene import Scene
+from physjax.scenes.registry import scene
 from physjax.stepping.reference import reference
 from physjax.study.problem import Problem, Truth
 

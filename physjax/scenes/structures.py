@@ -4,9 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics import contacts, forces, lattices
-from physjax.scene import Force, Particles, Scene, loads
-from physjax.scenes.gallery import scene
+from physjax.particles import Particles
+from physjax.parts import Force
+from physjax.physics import contacts, forces
+from physjax.physics.springs import lattices
+from physjax.scene import Scene, loads
+from physjax.scenes.registry import scene
 from physjax.study.problem import Problem, Truth
 
 SPAN, HEIGHT, PANELS = 12.0, 2.0, 6

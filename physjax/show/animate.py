@@ -12,14 +12,14 @@ from typing import Any
 from jax.typing import ArrayLike
 
 from physjax.checks import positive_integer, real_quantity
-from physjax.show.clouds import cloud_of
 from physjax.show.films import Film, schedule
+from physjax.show.frames import faces_of, take, take_lanes
 from physjax.show.panels import scenery_of
+from physjax.show.particles import cloud_of
 from physjax.show.solids import taken_bodies
-from physjax.show.strands import colour_bar, lines, strands_of, take_springs
+from physjax.show.spring_lines import colour_bar, lines, strands_of, take_springs
 from physjax.show.surfaces import surface
-from physjax.show.swarms import swarm_of, swarm_scenery
-from physjax.show.takes import faces_of, take, take_lanes
+from physjax.show.trails import swarm_of, swarm_scenery
 from physjax.show.view import View, view
 from physjax.trajectory import Trajectory
 
@@ -143,3 +143,7 @@ def particles(
 
 
 __all__ = ["Film", "View", "bodies", "cloth", "particles", "paths", "springs", "view"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from physjax.files import replacing, replacing_folder
+from physjax.show.drawables import Bodies, Dots, Lines, Surface, subject
 from physjax.show.films import schedule
+from physjax.show.frames import Take, batch_index, unbroken
 from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document
 from physjax.show.pages import demanded
-from physjax.show.report import progress_bar
-from physjax.show.subjects import Bodies, Dots, Lines, Surface, subject
-from physjax.show.takes import Take, batch_index, unbroken
+from physjax.text import progress_bar
 from physjax.trajectory import Trajectory
 
 __all__ = ["gltf", "ply"]
@@ -210,3 +210,7 @@ def _rgb(color: Any) -> tuple[float, float, float]:
 
 def _counted(items: Any, progress: bool) -> Any:
     return progress_bar(items, progress=progress, desc="writing", unit="frame", leave=False)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -13,10 +13,10 @@ import numpy as np
 from physjax.checks import real_quantity
 from physjax.files import replacing
 from physjax.show import obstacles
+from physjax.show.frames import Take
 from physjax.show.pages import demanded, filled, framed, write_page
 from physjax.show.panels import Scenery, arranged
-from physjax.show.report import progress_bar
-from physjax.show.takes import Take
+from physjax.text import progress_bar
 
 SHADED = 12_000
 """A picture that takes more bytes than this without loss is compressed with some."""

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics.contacts import Plane, Room, Slab, Sphere
-from physjax.physics.hulls import Touch
-from physjax.scene import Contact
+from physjax.parts import Contact
+from physjax.physics.contacts.shapes import Plane, Room, Slab, Sphere
+from physjax.physics.rigid.contact_points import Touch
 from physjax.show.stage import Stage
 
 GREY, STONE = "#9AA3AD", "#C9CDD2"

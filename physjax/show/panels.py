@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from physjax.show import obstacles
+from physjax.show.frames import Take
 from physjax.show.stage import Stage, axes, stage_of
-from physjax.show.takes import Take
 
 WIDTH = 7.2
 """A figure is at most so wide [inches], the width of a notebook."""

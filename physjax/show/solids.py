@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from physjax.checks import real_quantity
-from physjax.physics.inertia import Inertia
-from physjax.physics.meshes import checked_mesh
+from physjax.meshes import checked_mesh
+from physjax.physics.rigid.inertia import Inertia
+from physjax.show.frames import Take, picked, take_lanes
 from physjax.show.panels import panels, scenery_of
 from physjax.show.surfaces import surface
-from physjax.show.takes import Take, picked, take_lanes
 from physjax.trajectory import Trajectory
 
 ROUND = 24

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from physjax.show.takes import Take
+from physjax.show.frames import Take
 
 ELEVATION, AZIMUTH = 16.0, 28.0
 """From where space is seen [degrees]: from above, and turned from the axis after the one that is up (z if y is) to the next."""

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from physjax.show import obstacles
+from physjax.show.frames import faces_of, picked, take
 from physjax.show.obstacles import LIGHT
 from physjax.show.panels import Scenery, panels, scenery_of
-from physjax.show.takes import faces_of, picked, take
 from physjax.trajectory import Trajectory
 
 AMBIENT = 0.5

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from physjax.physics.contacts import Sphere
+from physjax.physics.contacts.shapes import Sphere
 from physjax.show import obstacles
+from physjax.show.drawables import Bodies, Dots, Lines, Surface, subject
 from physjax.show.films import schedule
+from physjax.show.frames import batch_index
 from physjax.show.pages import demanded, filled, framed, shipped, write_page
 from physjax.show.panels import Scenery, scenery_of
 from physjax.show.plot import MOST_LANES
+from physjax.show.spring_lines import strands_of
 from physjax.show.stage import AZIMUTH, ELEVATION
-from physjax.show.strands import strands_of
-from physjax.show.subjects import Bodies, Dots, Lines, Surface, subject
-from physjax.show.swarms import swarm_of
-from physjax.show.takes import batch_index
+from physjax.show.trails import swarm_of
 from physjax.trajectory import Trajectory
 
 FINEST = 32767

@@ -11,11 +11,12 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from physjax.backend import any_lane
 from physjax.checks import concrete, positive_integer, real_quantity
-from physjax.lanes import any_lane, wide
 from physjax.loops import Time, moment_at, now
-from physjax.particles import demand_particles
-from physjax.scene import as_module, project
+from physjax.particles import demand_particles, wide
+from physjax.parts import as_module
+from physjax.scene import project
 from physjax.vectors import norm
 
 SAFETY, LECTURE_SAFETY, SHRINK, GROW = 0.8, 0.9, 0.2, 5.0

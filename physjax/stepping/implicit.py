@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 
-from physjax.lanes import any_lane
+from physjax.backend import any_lane
 from physjax.loops import Time
 from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, solved, stabilised_biconjugate_gradients
 from physjax.stepping.registry import Promises

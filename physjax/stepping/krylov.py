@@ -13,7 +13,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.lanes import any_lane
+from physjax.backend import any_lane
 from physjax.vectors import scale
 
 Vector = list[Array]

@@ -135,3 +135,7 @@ __all__ = [
 def _along(state: Any, slope: Any, dt: ArrayLike) -> Any:
     """The state moved along a slope: y + dt·k."""
     return jax.tree.map(lambda y, k: y + scale(dt, k), state, slope)
+
+
+def __dir__() -> list[str]:
+    return __all__

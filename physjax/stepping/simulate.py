@@ -18,11 +18,12 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from physjax.backend import FEWEST, in_pieces
 from physjax.checks import concrete, positive_integer, real_quantity
 from physjax.closures import warn_of_remade
-from physjax.lanes import FEWEST, in_pieces
 from physjax.loops import LAST_STEP, moment_at, repeat, time_at
-from physjax.scene import Scene, as_module, changes, plain_functions
+from physjax.parts import as_module, changes, plain_functions
+from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, memories
 

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.scene import Particles, Scene
+from physjax.particles import Particles
+from physjax.scene import Scene
 from physjax.stepping import methods
 from physjax.stepping.reference import in_dtype, reference
 from physjax.stepping.simulate import simulate
-from physjax.study.energy import Conserved
+from physjax.study.energy.quantities import Conserved
 from physjax.trajectory import Trajectory
 
 FINE = 64

@@ -7,17 +7,18 @@ import jax
 import numpy as np
 
 from physjax.particles import Particles
-from physjax.physics.contacts import impact, project
-from physjax.scene import Scene
-from physjax.show import portrait
-from physjax.show.report import Picture, Section, Table, drawn, seconds_text
+from physjax.physics.contacts.time_of_impact import impact
+from physjax.scene import Scene, project
+from physjax.show import auto_plot
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
-from physjax.study.booking import LEGS
+from physjax.study.accuracy.result import ERRORS, Run, WorkPrecision
+from physjax.study.energy.audit import LEGS
 from physjax.study.problem import Problem
-from physjax.study.survey import fastest_moment, map_around
-from physjax.study.work_precision import ERRORS, Run, WorkPrecision
+from physjax.study.report_page import Picture, Section, Table, drawn
+from physjax.study.stability.survey import fastest_moment, map_around
+from physjax.text import seconds_text
 
 WANTED = 1e-4
 """Error, relative to the extent of the path, of the run whose books are closed and whose parts are left out."""
@@ -87,8 +88,8 @@ def sections(
 def _seen(studied: Studied) -> Iterator[Block]:
     yield studied.sentence
     run, looks = studied.problem.filmed(), studied.problem.looks
-    yield drawn(portrait.still(run, looks), f"Picture: {studied.sentence}")
-    yield Picture(portrait.moving(run, looks).gif(), f"Film: {studied.sentence}", kind="gif")
+    yield drawn(auto_plot.still(run, looks), f"Picture: {studied.sentence}")
+    yield Picture(auto_plot.moving(run, looks).gif(), f"Film: {studied.sentence}", kind="gif")
 
 
 def _charted(studied: Studied) -> Iterator[Block]:

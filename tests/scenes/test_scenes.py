@@ -6,7 +6,7 @@ import pytest
 
 from physjax import methods, simulate
 from physjax.scenes import SCENES, title
-from physjax.scenes.gallery import table
+from physjax.scenes.registry import table
 
 SLOW = ("car", "ragdoll", "tumbling_box", "rolling", "bowling", "smoke", "sparks")
 """What compiles for many seconds."""

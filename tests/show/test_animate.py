@@ -12,7 +12,7 @@ from PIL import Image
 
 from physjax import Particles, Scene, animate, contacts, forces, methods, simulate
 from physjax.show.films import schedule
-from physjax.show.takes import Take
+from physjax.show.frames import Take
 
 
 def clock(times):

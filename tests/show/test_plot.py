@@ -8,9 +8,11 @@ import pytest
 
 from physjax import methods, simulate
 from physjax.scenes import SCENES
-from physjax.show import plot, report
+from physjax.show import plot, style
 from physjax.stepping.methods import METHODS
+from physjax.study import report_page
 from physjax.study.accuracy import Budget, work_precision
+from physjax.text import seconds_text, table
 
 
 @pytest.fixture(autouse=True)
@@ -67,7 +69,7 @@ def test_methods_keep_apart_in_colour_and_marker():
 
 def test_both_treatments_of_a_bounce_are_told_apart_and_belong_together():
     for name in METHODS:
-        timed, projected = plot.style(name), plot.style(name + plot.PROJECTED)
+        timed, projected = plot.style(name), plot.style(name + style.PROJECTED)
         assert (projected["color"], projected["marker"]) == (timed["color"], timed["marker"])
         assert (timed["linestyle"], projected["linestyle"]) == ("-", "--")
         assert projected["markerfacecolor"] == "white"
@@ -78,7 +80,7 @@ def test_the_legend_has_room_below_the_panels():
         SCENES["tennis_ball"](), [methods.verlet], [0.01], budget=Budget(0.02, 1, 2.0), name="tennis"
     )
     runs = tuple(
-        run._replace(method=name + end) for run in study.runs for name in METHODS for end in ("", plot.PROJECTED)
+        run._replace(method=name + end) for run in study.runs for name in METHODS for end in ("", style.PROJECTED)
     )
     figure = study._replace(runs=runs, promised={run.method: 1.0 for run in runs}).plot()
     figure.canvas.draw()
@@ -94,8 +96,8 @@ def test_the_legend_has_room_below_the_panels():
 
 
 def test_table_is_aligned():
-    text = report.table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
-    lines = text.splitlines()
+    aligned = table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
+    lines = aligned.splitlines()
     assert len({len(line) for line in lines}) == 1
     assert lines[2].startswith("euler ")
     assert lines[3].endswith(" 20")
@@ -106,14 +108,18 @@ def test_table_is_aligned():
     [(0.99999994, "1 s"), (3e-6, "3 µs"), (0.0123, "12.3 ms"), (2.5, "2.5 s"), (86400 * 10, "10 d")],
 )
 def test_times_are_readable(seconds, text):
-    assert report.seconds_text(seconds) == text
+    assert seconds_text(seconds) == text
 
 
 def test_page_is_self_contained():
-    page = report.page(
+    page = report_page.page(
         "title",
         "a < b",
-        [report.Section("kepler", "two bodies", report.Picture(b"png", "an orbit"), report.Table("a table"))],
+        [
+            report_page.Section(
+                "kepler", "two bodies", report_page.Picture(b"png", "an orbit"), report_page.Table("a table")
+            )
+        ],
     )
     assert "a &lt; b" in page
     assert "data:image/png;base64," in page

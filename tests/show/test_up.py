@@ -8,7 +8,7 @@ import pytest
 
 from physjax import Particles, Scene, animate, contacts, forces, methods, simulate
 from physjax.show import export, obstacles, plot
-from physjax.show.portrait import still
+from physjax.show.auto_plot import still
 from physjax.show.solids import _turned
 
 

@@ -12,8 +12,8 @@ from physjax.cli import main
 from physjax.scenes import SCENES, title
 from physjax.stepping.methods import METHODS
 from physjax.study import scene_report
+from physjax.study.accuracy.result import Run, WorkPrecision
 from physjax.study.scene_report import NO_RUN, PARTS, WANTED, Studied
-from physjax.study.work_precision import Run, WorkPrecision
 
 
 class Pictures(HTMLParser):

@@ -1,0 +1,77 @@
+"""What a touch does to a velocity: restitution along the normal, friction across it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.checks import concrete, demand, quantity
+from physjax.particles import Particles
+from physjax.vectors import dot, scale
+
+
+class Coulomb(eqx.Module):
+    """Dry friction: a touch holds up to μ_s times the normal impulse or force; beyond, it slips, braked by μ_k times it.
+
+    Example:
+        >>> dry = contacts.Coulomb(static=0.6, kinetic=0.5)
+        >>> road = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0, coulomb=dry)
+        >>> skid = Particles(jnp.array([0.0, -0.1]), jnp.array([3.0, -4.0]))
+        >>> print(road.respond(0.0, skid).velocity)
+        [1. 0.]
+    """
+
+    static: Float[Array, "..."] = quantity("static friction μ_s", "1", at_least=0)
+    kinetic: Float[Array, "..."] = quantity("kinetic friction μ_k", "1", at_least=0)
+
+    def __check_init__(self):
+        static, kinetic = concrete(self.static), concrete(self.kinetic)
+        if static is not None and kinetic is not None:
+            demand("kinetic friction μ_k [1]", self.kinetic, kinetic <= static, f"at most the static μ_s = {static}")
+
+    def relations(self) -> tuple[Array, ...]:
+        """What must hold between its numbers, also where they are traced."""
+        return (self.kinetic <= self.static,)
+
+
+def rebound(
+    surface: eqx.Module,
+    state: Particles,
+    touch: tuple[Array, Array, Array],
+    inward: Float[Array, "*lanes"],
+    rests: Array | None = None,
+) -> Particles:
+    """v' = (1 - K_f) v_t - K_r v_n relative to the surface, and the position moved back to it.
+
+    `touch` is depth (<= 0), normal and relative velocity; `inward` (<= 0) the normal velocity of lanes that touch, 0 of
+    all others. Lanes that come to rest (`rests`) bounce no more, and keep no tangential velocity where K_f > 0.
+    """
+    depth, normal, relative = touch
+    restitution = surface.restitution if rests is None else jnp.where(rests, 0.0, surface.restitution)
+    push = (1 + restitution) * inward
+    loss = _tangential_loss(surface, relative, inward, -push, rests)
+    x, v = state
+    # per-lane coefficients instead of a choice between vectors, which would cost several times the step
+    if loss is not None:
+        v = v - scale(loss, relative)
+        push = push - loss * inward
+    return Particles(x - scale(depth, normal), v - scale(push, normal))
+
+
+def _tangential_loss(
+    surface: eqx.Module, relative: Array, inward: Array, impulse: Array, rests: ArrayLike | None
+) -> Array | None:
+    """The fraction of the tangential velocity that a touch takes, per lane; None for a frictionless surface.
+
+    `impulse` is the normal one, per unit of mass.
+    """
+    if surface.friction is not None:
+        loss = surface.friction if rests is None else jnp.where(rests & (surface.friction > 0), 1.0, surface.friction)
+        return jnp.where(inward < 0, loss, 0.0)
+    if surface.coulomb is None:
+        return None
+    # by Pythagoras, without the tangential vector; the floor keeps the slope of the root finite
+    speed = jnp.sqrt(jnp.maximum(dot(relative, relative) - inward * inward, 1e-30))
+    slipping = speed > surface.coulomb.static * impulse
+    share = surface.coulomb.kinetic * impulse / jnp.where(slipping, speed, 1.0)
+    return jnp.where(inward < 0, jnp.where(slipping, share, 1.0), 0.0)

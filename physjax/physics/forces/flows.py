@@ -1,0 +1,158 @@
+"""What streams and what draws: flows that carry particles along, and a centre that attracts them.
+
+A flow gives the velocity of the air, `flow(t, position)` [m/s]; as a force it is b·u, the part of Stokes' drag
+-b (v - u) that the air's own motion adds. So a flow goes beside `StokesDrag` with the same coefficient b [kg/s].
+"""
+
+import math
+from abc import abstractmethod
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.checks import declared, positive_integer, quantity
+from physjax.particles import Particles
+from physjax.parts import Field, Force
+from physjax.vectors import components, cross, dot, norm, over, scale, stacked, turn_left, unit
+
+
+class Flow(Force):
+    """Air that moves: F = b u(t, x), to be added to `StokesDrag(b)`.
+
+    Example:
+        >>> class Wind(fields.Flow):
+        ...     coefficient: float
+        ...     def flow(self, t, position):
+        ...         return jnp.full_like(position, 4.0)
+        >>> print(Wind(0.5)(0.0, ball, shot.mass))
+        [2. 2.]
+    """
+
+    @abstractmethod
+    def flow(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """Velocity of the air [m/s]."""
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """b u [N]."""
+        return scale(self.coefficient, self.flow(t, state.position))
+
+
+class Turbulence(Flow):
+    """Eddies without divergence: u = Σ aᵢ cos(kᵢ·x + ωᵢt + φᵢ) with each aᵢ at right angles to its kᵢ, so that ∇·u = 0 exactly.
+
+    In time and in space `speed` [m/s] is the root mean square of |u|. Eddies are about `size` [m] wide, |kᵢ| even from
+    half to one and a half of 2π/size, and turn over as fast as they pass, ωᵢ = |kᵢ| speed. A few random Fourier `modes`
+    after R. H. Kraichnan, "Diffusion by a random velocity field", Phys. Fluids 13 (1970) 22. `key` is a seed or a
+    `jax.random.key`; `dim` 2 or 3.
+
+    Example:
+        >>> eddies = fields.Turbulence(coefficient=1.0, speed=2.0, size=0.5, key=0, dim=2)
+        >>> slopes = jax.jit(jax.jacfwd(lambda x: eddies.flow(0.0, x)))(ball.position)
+        >>> bool(abs(slopes[0, 0] + slopes[1, 1]) < 1e-4)
+        True
+    """
+
+    coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
+    speed: Float[Array, ""] = quantity("speed of the eddies", "m/s", per=None, at_least=0)
+    size: Float[Array, ""] = quantity("size of the eddies", "m", per=None, above=0)
+    waves: Float[Array, "modes dim"] = declared("wave vectors", "1/m", per=None)
+    swings: Float[Array, "modes dim"] = declared("amplitudes", per=None)
+    phases: Float[Array, "modes"] = declared("phases", "rad", per=None)
+
+    def __init__(
+        self, coefficient: ArrayLike, speed: ArrayLike, size: ArrayLike, *, key: Any, dim: int = 3, modes: int = 8
+    ):
+        if dim not in (2, 3):
+            raise ValueError(f"Turbulence: got dim {dim}, expected 2 or 3.")
+        self.coefficient, self.speed, self.size = coefficient, speed, size
+        modes = positive_integer("modes", modes)
+        key = jax.random.key(key) if isinstance(key, int) else key
+        along, across, long, late = jax.random.split(key, 4)
+        waves = unit(jax.random.normal(along, (modes, dim)))
+        other = turn_left(waves) if dim == 2 else unit(cross(waves, jax.random.normal(across, (modes, dim))))
+        self.swings = math.sqrt(2 / modes) * other
+        self.waves = scale(2 * math.pi * jax.random.uniform(long, (modes,), minval=0.5, maxval=1.5), waves)
+        self.phases = 2 * math.pi * jax.random.uniform(late, (modes,))
+
+    def flow(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """The sum of the modes [m/s]."""
+        x = components(position / self.size)
+        turned = jnp.asarray(t, position.dtype) * (self.speed / self.size)
+        total = [jnp.zeros_like(x[0])] * len(x)
+        for i in range(self.phases.shape[0]):
+            wave, pace = components(self.waves[i]), norm(self.waves[i])
+            swing = jnp.cos(sum(k * a for k, a in zip(wave, x, strict=True)) + (pace * turned + self.phases[i]))
+            total = [u + a * swing for u, a in zip(total, components(self.swings[i]), strict=True)]
+        return self.speed * stacked(total)
+
+
+class Vortex(Flow):
+    """A whirl about an axis, Lamb and Oseen's: u = Γ/(2πr)·(1 - exp(-r²/c²)) around, a solid turn within its core c [m].
+
+    `circulation` Γ [m²/s] turns anticlockwise about the `axis`, a vector in space; in the plane there is none to give.
+
+    Example:
+        >>> whirl = fields.Vortex(coefficient=1.0, circulation=20.0 * np.pi, core=0.1, center=(0.0, 0.0))
+        >>> print(whirl(0.0, ball, shot.mass))
+        [-1.  0.]
+    """
+
+    coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
+    circulation: Float[Array, "..."] = quantity("circulation", "m²/s")
+    core: Float[Array, "..."] = quantity("radius of the core", "m", above=0)
+    center: Float[Array, "..."] = quantity("center of the vortex", "m", kind="place")
+    axis: Float[Array, "..."] | None = quantity("axis of the vortex", "1", kind="vector", default=None)
+
+    def __check_init__(self):
+        if (self.axis is None) != (self.center.shape[-1:] == (2,)):
+            raise ValueError(
+                f"Vortex: got center {self.center.shape} and axis {None if self.axis is None else self.axis.shape}, "
+                "expected an axis in space, none in the plane."
+            )
+
+    def flow(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """Γ/(2πr²)·(1 - exp(-r²/c²)) n × r [m/s]."""
+        away = position - over(self.center, position)
+        around = turn_left(away) if self.axis is None else cross(over(unit(self.axis), position), away)
+        turns = dot(around, around) / self.core**2
+        # (1 - e^-s)/s, which is 1 where s is 0
+        small = turns < 1e-12
+        share = jnp.where(small, 1.0, -jnp.expm1(-turns) / jnp.where(small, 1.0, turns))
+        return scale(self.circulation / (2 * math.pi * self.core**2) * share, around)
+
+
+class Attractor(Field):
+    """A centre that draws all masses alike: a = -μ d/(d² + ε²)^(3/2), d from the `center` [m]; μ [m³/s²] is its GM.
+
+    The `softening` ε [m] (Plummer's) keeps what passes through the centre finite.
+
+    Example:
+        >>> sun = fields.Attractor(strength=1000.0, softening=1e-3, center=(0.0, 0.0))
+        >>> print(sun.acceleration(0.0, ball, shot.mass))
+        [ -0. -10.]
+    """
+
+    strength: Float[Array, "..."] = quantity("strength μ", "m³/s²")
+    softening: Float[Array, "..."] = quantity("softening", "m", above=0)
+    center: Float[Array, "..."] = quantity("center of the attractor", "m", kind="place")
+
+    def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """-μ d/(d² + ε²)^(3/2) [m/s²]."""
+        d = state.position - over(self.center, state.position)
+        near = 1 / jnp.sqrt(dot(d, d) + self.softening**2)
+        return scale(-self.strength * near**3, d)
+
+    def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
+        """-mμ/√(d² + ε²) [J]."""
+        d = state.position - over(self.center, state.position)
+        return -mass * self.strength / jnp.sqrt(dot(d, d) + self.softening**2)
+
+
+__all__ = ["Attractor", "Flow", "Turbulence", "Vortex"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,53 @@
+"""Rigid bodies: how they begin, what acts on them, and how their points move.
+
+    from physjax import RigidBodies, Scene, forces, inertia, rigid
+
+    brick = inertia.box(2.0, size=(0.3, 0.1, 0.2))
+    thrown = Scene(rigid.bodies(brick, velocity=(5, 3, 0), angular_velocity=(0, 1, 9)), brick, (forces.Gravity(),))
+
+Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
+inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
+`Hull`; `contacts=(Touch(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
+"""
+
+from physjax.physics.rigid.contact_points import Hull, Touch
+from physjax.physics.rigid.joints import Joints, hinge
+from physjax.physics.rigid.loads import (
+    AtPoint,
+    RotationalDrag,
+    Thrust,
+    Torque,
+    bodies,
+    on_bodies,
+    point,
+    point_acceleration,
+    point_velocity,
+)
+from physjax.physics.rigid.pairs import Balls
+from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_acceleration, angular_velocity
+
+__all__ = [
+    "AtPoint",
+    "Balls",
+    "Hull",
+    "Joints",
+    "Load",
+    "RigidBodies",
+    "RotationalDrag",
+    "Thrust",
+    "Torque",
+    "Touch",
+    "Wrench",
+    "angular_acceleration",
+    "angular_velocity",
+    "bodies",
+    "hinge",
+    "on_bodies",
+    "point",
+    "point_acceleration",
+    "point_velocity",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

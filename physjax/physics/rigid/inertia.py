@@ -1,0 +1,363 @@
+"""Inertia: mass, principal moments and axes of the usual solids, of points, of closed meshes, and of what is made of them.
+
+Closed forms may be traced: masses and sizes can be swept and differentiated. A full tensor is diagonalised once, on the
+host and in double precision.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+from numpy.linalg import eigh
+
+from physjax.checks import concrete, declared, demand, real_quantity
+from physjax.meshes import checked_mesh
+from physjax.physics.rigid.inertia_tensors import (
+    demand_closed,
+    find_quaternion,
+    read_on_host,
+    shift_inertia,
+    turn_tensor,
+)
+from physjax.vectors import components, dot, scale
+
+
+class Inertia(eqx.Module):
+    """Mass [kg] and principal moments about the centre of mass [kg m²] of rigid bodies: `mass=` of their scene.
+
+    `mass` is a scalar or per lane, `principal` `(3,)` or `(*lanes, 3)`, `axes` a quaternion from the principal axes to
+    the body's frame, None where they are the same. A line has no moment about itself and cannot spin about it. `about`
+    a point of itself, a body turns on a fixed pivot. Raises ValueError for numbers that no body has.
+
+    Example:
+        >>> Scene(body, mass=Inertia(mass=12.0, principal=(13.0, 10.0, 5.0))).mass.principal.tolist()
+        [13.0, 10.0, 5.0]
+    """
+
+    mass: Float[Array, "..."] = declared("mass", "kg", above=0)
+    principal: Float[Array, "*lanes 3"] = declared("principal moments", "kg m²", kind="vector", at_least=0)
+    axes: Float[Array, "*lanes 4"] | None = declared("axes", kind="rotation")
+    arm: Float[Array, "*lanes 3"] | None = declared("arm of the pivot", "m", kind="vector")
+    pivot: Float[Array, "*lanes 3"] | None = declared("pivot", "m", kind="place")
+
+    def __init__(self, mass: Any, principal: Any, axes: Any = None):
+        self.mass = real_quantity("mass [kg]", mass, above=0.0)
+        self.principal = _real_moments(principal)
+        self.axes = None if axes is None else real_turn("axes", axes)
+        self.arm = self.pivot = None
+
+    @property
+    def inverse(self) -> Float[Array, "*lanes 3"]:
+        """1/I about each principal axis [1/(kg m²)]; zero where there is no moment."""
+        there = self.principal > 0
+        return jnp.where(there, 1 / jnp.where(there, self.principal, 1.0), 0.0)
+
+    @property
+    def tensor(self) -> np.ndarray:
+        """The full tensor in the body's frame [kg m²], `(*lanes, 3, 3)`, about the centre of mass or the pivot."""
+        (principal,) = read_on_host("tensor", self.principal)
+        tensor = principal[..., None] * np.eye(3)
+        return tensor if self.axes is None else turn_tensor(*read_on_host("axes", self.axes), tensor)
+
+    def about(self, point: Any) -> "Inertia":
+        """The same body on a fixed pivot: a `point` [m] of it, in its frame, from its centre of mass.
+
+        The moments are then those about the pivot, by the parallel-axis theorem. The pivot is where that point is when
+        a scene starts, and there it stays. A point on a principal axis whose zeros can be seen, (0, 0, l), may be
+        traced; any other is worked out on the host.
+        """
+        if self.arm is not None:
+            raise ValueError("about: got an inertia with a pivot, expected one about the centre of mass.")
+        parts = _components("pivot [m]", point)
+        away = [i for i, part in enumerate(parts) if concrete(part) is None or np.any(concrete(part))]
+        point = jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
+        if self.axes is None and len(away) <= 1:
+            square = self.mass * dot(point, point)
+            more = [jnp.zeros_like(square) if [i] == away else square for i in range(3)]
+            body = Inertia(self.mass, sum(jnp.broadcast_arrays(self.principal, jnp.stack(more, axis=-1))))
+        else:
+            body = of_tensor(self.mass, self.tensor + shift_inertia(*read_on_host("pivot", self.mass, point)))
+        return eqx.tree_at(lambda body: body.arm, body, -point, is_leaf=lambda leaf: leaf is None)
+
+    def checked(self, lanes: tuple[int, ...], dtype: Any) -> "Inertia":
+        """The inertia of bodies in lanes of this shape, its numbers in this dtype; a ValueError where they do not fit."""
+        for name, width in (("mass", ()), ("principal", (3,)), ("axes", (4,)), ("arm", (3,))):
+            array = getattr(self, name)
+            if array is not None and array.shape not in (width, (*lanes, *width)):
+                raise ValueError(f"Inertia: got {name} of shape {array.shape}, expected {width} or {(*lanes, *width)}.")
+        numbers = [None if a is None else a.astype(dtype) for a in (self.mass, self.principal, self.axes, self.arm)]
+        return eqx.tree_at(
+            lambda i: (i.mass, i.principal, i.axes, i.arm), self, numbers, is_leaf=lambda leaf: leaf is None
+        )
+
+    def hung(self, pivot: Float[Array, "*lanes 3"]) -> "Inertia":
+        """The inertia with its pivot at a place of the world [m]."""
+        return eqx.tree_at(lambda i: i.pivot, self, pivot, is_leaf=lambda leaf: leaf is None)
+
+
+class Solid(NamedTuple):
+    """An inertia, and where the centre of mass is in the coordinates that were given [m].
+
+    Example:
+        >>> pair = inertia.points([1.0, 3.0], [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+        >>> isinstance(pair, inertia.Solid), pair.center.tolist()
+        (True, [3.0, 0.0, 0.0])
+    """
+
+    inertia: Inertia
+    center: np.ndarray
+
+
+# closed forms
+
+
+def box(mass: ArrayLike, size: ArrayLike) -> Inertia:
+    """A box with edges a, b, c [m] along the axes: I = m/12 (b² + c², c² + a², a² + b²).
+
+    Example:
+        >>> inertia.box(12.0, (1.0, 2.0, 3.0)).principal.tolist()
+        [13.0, 10.0, 5.0]
+    """
+    size = real_quantity("size [m]", size, above=0.0)
+    if size.shape[-1:] != (3,):
+        raise ValueError(f"size [m]: got the shape {size.shape}, expected three edges, (3,) or (*lanes, 3).")
+    a, b, c = jnp.moveaxis(size**2, -1, 0)
+    return _of_shape(mass, 1 / 12, b + c, c + a, a + b)
+
+
+def sphere(mass: ArrayLike, radius: ArrayLike, *, hollow: bool = False) -> Inertia:
+    """A ball: I = 2/5 m r²; a thin shell: 2/3 m r².
+
+    Example:
+        >>> inertia.sphere(5.0, radius=2.0).principal.tolist()
+        [8.0, 8.0, 8.0]
+    """
+    square = real_quantity("radius [m]", radius, above=0.0) ** 2
+    return _of_shape(mass, 2 / 3 if hollow else 2 / 5, square, square, square)
+
+
+def cylinder(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
+    """A cylinder along an axis of its frame (2: z): I = m r²/2 about it, m (3r² + l²)/12 across.
+
+    Example:
+        >>> inertia.cylinder(12.0, radius=1.0, length=3.0).principal.tolist()
+        [12.0, 12.0, 6.0]
+    """
+    radius, length = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)
+    return _along(mass, axis, radius**2 / 2, (3 * radius**2 + length**2) / 12)
+
+
+def rod(mass: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
+    """A thin rod along an axis of its frame: I = m l²/12 across, none about itself.
+
+    Example:
+        >>> inertia.rod(3.0, length=2.0).principal.tolist()
+        [1.0, 1.0, 0.0]
+    """
+    length = real_quantity("length [m]", length, above=0.0)
+    return _along(mass, axis, 0.0 * length, length**2 / 12)
+
+
+def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
+    """A cylinder of a `length` between its ends' hemispheres, of one density.
+
+    With their shares of the mass, s = 4r/(3l + 4r) and 1 - s: I = (1 - s) m r²/2 + s m 2r²/5 about the axis, (1 - s)
+    m (3r² + l²)/12 + s m (2r²/5 + l²/4 + 3lr/8) across.
+
+    Example:
+        >>> print(inertia.capsule(7.0, radius=1.0, length=1.0).principal)
+        [5.1 5.1 3.1]
+    """
+    r, l = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)  # noqa: E741
+    s = 4 * r / (3 * l + 4 * r)
+    about = (1 - s) * r**2 / 2 + s * 2 * r**2 / 5
+    across = (1 - s) * (3 * r**2 + l**2) / 12 + s * (2 * r**2 / 5 + l**2 / 4 + 3 * l * r / 8)
+    return _along(mass, axis, about, across)
+
+
+# by the full tensor
+
+
+def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
+    """The inertia of a full symmetric tensor in the body's frame [kg m²], `(3, 3)` or per lane; diagonalised on the host.
+
+    Example:
+        >>> print(inertia.of_tensor(1.0, [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 3.0]]).principal)
+        [1. 3. 3.]
+    """
+    (tensor,) = read_on_host("tensor", tensor)
+    if tensor.shape[-2:] != (3, 3):
+        raise ValueError(f"tensor [kg m²]: got shape {tensor.shape}, expected (3, 3) or (*lanes, 3, 3).")
+    size = np.abs(tensor).max(axis=(-2, -1), keepdims=True)
+    rounding = 64 * np.finfo(float).eps * size
+    if not np.isfinite(tensor).all() or (np.abs(tensor - np.swapaxes(tensor, -2, -1)) > rounding).any():
+        raise ValueError(
+            f"tensor [kg m²]: got {tensor.tolist()}, expected finite numbers, symmetric about the diagonal."
+        )
+    if (np.abs(tensor * (1 - np.eye(3))) <= rounding).all():
+        return Inertia(mass, np.diagonal(tensor, axis1=-2, axis2=-1))
+    principal, columns = eigh(tensor)
+    right_handed = np.sign(np.sum(columns[..., 0] * np.cross(columns[..., 1], columns[..., 2]), axis=-1))
+    principal = np.where(np.abs(principal) <= rounding[..., 0], 0.0, principal)
+    return Inertia(mass, principal, find_quaternion(columns * right_handed[..., None, None]))
+
+
+def points(masses: ArrayLike, positions: ArrayLike) -> Solid:
+    """Point masses [kg] `(n,)` held together at positions [m] `(n, 3)`: I = Σ m (|r|² 1 - r rᵀ).
+
+    Example:
+        >>> cross = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0]]
+        >>> print(np.sort(inertia.points(np.ones(4), cross).inertia.principal))
+        [ 2.  8. 10.]
+    """
+    masses, positions = read_on_host("points", real_quantity("masses [kg]", masses, above=0.0), positions)
+    if positions.ndim != 2 or positions.shape != (masses.size, 3) or masses.ndim != 1:
+        raise ValueError(
+            f"points: got masses {masses.shape} and positions {positions.shape}, expected (n,) and (n, 3)."
+        )
+    center = np.sum(masses[:, None] * positions, axis=0) / masses.sum()
+    return Solid(of_tensor(masses.sum(), shift_inertia(masses, positions - center).sum(axis=0)), center)
+
+
+def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float | None = None) -> Solid:
+    """What a closed surface of triangles encloses, by the divergence theorem; give its mass [kg] or density [kg/m³].
+
+    Exact for the polyhedron: a sum over the tetrahedra between each face and a point. `meshes.read_mesh` reads
+    vertices [m] and faces from a file. Raises ValueError for a mesh that is open, or whose faces do not turn alike.
+
+    Example:
+        >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> solid = inertia.mesh(corners, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], density=6.0)
+        >>> round(float(solid.inertia.mass), 3), solid.center.round(3).tolist()
+        (1.0, [0.25, 0.25, 0.25])
+    """
+    if (mass is None) == (density is None):
+        raise ValueError("mesh: expected either mass= [kg] or density= [kg/m³].")
+    vertices, faces = checked_mesh(vertices, faces)
+    demand_closed(faces)
+    middle = vertices.mean(axis=0)
+    a, b, c = (vertices[faces[:, i]] - middle for i in range(3))
+    volume = np.sum(a * np.cross(b, c), axis=-1) / 6
+    whole = volume.sum()
+    if abs(whole) <= 1e-12 * np.abs(volume).sum():
+        raise ValueError(f"mesh: encloses a volume of {whole:g} m³, expected a body.")
+    edges = np.stack([a, b, c, a + b + c])
+    center = np.sum(volume[:, None] * edges[3], axis=0) / (4 * whole)
+    second = np.sum(volume[:, None, None] / 20 * np.sum(edges[..., :, None] * edges[..., None, :], axis=0), axis=0)
+    mass = abs(whole) * density if mass is None else mass
+    (heavy,) = read_on_host("mass", real_quantity("mass [kg]", mass, above=0.0))
+    second = heavy * (second / whole - center[:, None] * center)
+    return Solid(of_tensor(heavy, np.trace(second) * np.eye(3) - second), middle + center)
+
+
+def composite(parts: Any) -> Solid:
+    """Bodies held together: `(inertia, position)` or `(inertia, position, orientation)` for each, by the parallel-axis theorem.
+
+    Positions [m] of the centres of mass and orientations (quaternions) are in the frame of the whole.
+
+    Example:
+        >>> pair = inertia.composite([(inertia.sphere(5.0, 1.0), (0.0, 0.0, z)) for z in (-2.0, 2.0)])
+        >>> print(pair.inertia.principal)
+        [44. 44.  4.]
+    """
+    parts = [(*part, (1.0, 0.0, 0.0, 0.0))[:3] for part in parts]
+    if not parts or any(not isinstance(body, Inertia) or body.arm is not None for body, _, _ in parts):
+        raise ValueError("composite: expected (inertia, position) or (inertia, position, orientation) for each part.")
+    masses, positions = read_on_host(
+        "composite", [float(body.mass) for body, _, _ in parts], [place for _, place, _ in parts]
+    )
+    center = np.sum(masses[:, None] * positions, axis=0) / masses.sum()
+    whole = shift_inertia(masses, positions - center).sum(axis=0)
+    for body, _, orientation in parts:
+        (q,) = read_on_host("orientation", real_turn("orientation", orientation))
+        whole = whole + turn_tensor(q, body.tensor)
+    return Solid(of_tensor(masses.sum(), whole), center)
+
+
+# the checks, and the host's part
+
+
+def real_turn(name: str, value: Any) -> Float[Array, "*lanes 4"]:
+    """A quaternion (w, x, y, z) brought to length 1; a ValueError for zero, which turns nothing anywhere.
+
+    Example:
+        >>> print(inertia.real_turn("orientation", (3.0, 0.0, 0.0, 4.0)))
+        [0.6 0.  0.  0.8]
+    """
+    q = real_quantity(name, value)
+    if q.shape[-1:] != (4,):
+        raise ValueError(f"{name}: got shape {q.shape}, expected a quaternion (w, x, y, z), (4,) or (*lanes, 4).")
+    if concrete(q) is not None:
+        demand(
+            name, q, np.any(concrete(q) != 0, axis=-1, keepdims=True) | np.zeros(q.shape, bool), "a quaternion not zero"
+        )
+    return scale(1 / jnp.sqrt(dot(q, q)), q)
+
+
+def _components(name: str, vector: Any) -> list[Array]:
+    """The components of a vector one by one; written as a tuple of three, each may be traced or not."""
+    if isinstance(vector, list | tuple) and not isinstance(vector[0], list | tuple):
+        parts = [real_quantity(name, part) for part in vector]
+    else:
+        parts = components(real_quantity(name, vector))
+    if len(parts) != 3:
+        raise ValueError(f"{name}: got {len(parts)} components, expected 3.")
+    return parts
+
+
+def _real_moments(value: Any) -> Float[Array, "*lanes 3"]:
+    """Principal moments that a body can have: none negative, none greater than the sum of the others."""
+    principal = real_quantity("principal moments [kg m²]", value, at_least=0.0)
+    if principal.shape[-1:] != (3,):
+        raise ValueError(f"principal moments [kg m²]: got shape {principal.shape}, expected (3,) or (*lanes, 3).")
+    values = concrete(principal)
+    if values is not None:
+        rounding = 1 + 64 * np.finfo(values.dtype).eps
+        good = (2 * values.max(axis=-1) <= rounding * values.sum(axis=-1)) & (values.max(axis=-1) > 0)
+        if not good.all():
+            raise ValueError(
+                f"principal moments [kg m²]: got {values[~good].reshape(-1, 3)[0].tolist()}, expected none greater than "
+                "the sum of the other two (the triangle inequality), and not all zero: no body has such moments."
+            )
+    return principal
+
+
+def _of_shape(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
+    mass = real_quantity("mass [kg]", mass, above=0.0)
+    return Inertia(
+        mass,
+        scale(factor * mass, jnp.stack(moments, axis=-1))
+        if mass.ndim == 0
+        else jnp.stack([factor * mass * m for m in moments], axis=-1),
+    )
+
+
+def _along(mass: ArrayLike, axis: int, about: Array, across: Array) -> Inertia:
+    """Moments for a kilogram about an axis of the body and across it."""
+    if axis not in (0, 1, 2):
+        raise ValueError(
+            f"axis: got {axis!r}, expected 0, 1 or 2: the axis of the body's frame that the shape is along."
+        )
+    return _of_shape(mass, 1.0, *(about if i == axis else across for i in range(3)))
+
+
+__all__ = [
+    "Inertia",
+    "Solid",
+    "box",
+    "capsule",
+    "composite",
+    "cylinder",
+    "mesh",
+    "of_tensor",
+    "points",
+    "rod",
+    "sphere",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

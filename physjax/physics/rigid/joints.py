@@ -1,0 +1,114 @@
+"""Joints between bodies: stiff damped springs between points of theirs that should be one place."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.checks import declared, quantity, real_quantity
+from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity, in_world
+from physjax.vectors import cross, dot, norm, scale
+
+
+class Joints(Load):
+    """Ball joints: F = k d + c ḋ at a point of each of two bodies, d [m] from the first point to the second.
+
+    `pairs` `(joints, 2)` are indices into the last lane axis, `points` `(joints, 2, 3)` the places [m] in the frames of
+    the two bodies, from their centres of mass. Stiffness k [N/m] and damping c [kg/s] are one for all. A hinge is two
+    ball joints on its axis: see `hinge`. The points part by about load/k, which `error` tells; a step must resolve
+    √(m/k) of the lightest body: the lighter and the smaller, the stiffer.
+
+    Example:
+        >>> arm = rigid.Joints([(0, 1)], [[[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]], stiffness=1e3)
+        >>> print(arm.error(rigid.bodies(brick, [[0.0, 0.0, 0.0], [1.25, 0.0, 0.0]])))
+        [0.25]
+    """
+
+    couples: ClassVar[bool] = True
+    points: Float[Array, "joints 2 3"] = declared("points of the joints", "m", kind="place", per=None)
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", per="joint", above=0)
+    damping: Float[Array, "..."] = quantity("damping c", "kg/s", per="joint", at_least=0)
+
+    def __init__(self, pairs: Any, points: Any, stiffness: Any, damping: Any = 0.0):
+        pairs = np.asarray(pairs)
+        self.points = real_quantity("points of the joints [m]", points)
+        whole = pairs.dtype.kind in "iu" and pairs.ndim == 2 and pairs.shape[1:] == (2,) and pairs.size
+        if not whole or (pairs < 0).any() or (pairs[:, 0] == pairs[:, 1]).any():
+            raise ValueError(f"Joints: got pairs {pairs.tolist()}, expected (joints, 2) indices of different bodies.")
+        if self.points.shape != (len(pairs), 2, 3):
+            raise ValueError(
+                f"Joints: got points {self.points.shape}, expected {(len(pairs), 2, 3)}: one on each body."
+            )
+        self.pairs = tuple((int(i), int(j)) for i, j in pairs)
+        self.stiffness = real_quantity("stiffness k [N/m]", stiffness, above=0.0)
+        self.damping = real_quantity("damping c [kg/s]", damping, at_least=0.0)
+
+    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+        """Forces and torques on all bodies, equal and opposite at each joint."""
+        arms, apart = self._arms(bodies)
+        straight = self._ends(scale(1 / inertia.mass, bodies.momentum))
+        turning = self._ends(angular_velocity(bodies, inertia))
+        fast = [v + cross(omega, arm) for v, omega, arm in zip(straight, turning, arms, strict=True)]
+        pull = self.stiffness * apart + self.damping * (fast[1] - fast[0])
+        forces = jnp.concatenate([pull, -pull], axis=-2)
+        torques = jnp.concatenate([cross(arms[0], pull), cross(arms[1], -pull)], axis=-2)
+        return Wrench(self._gathered(forces, bodies), self._gathered(torques, bodies))
+
+    def potential(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes"]:
+        """½k d² [J], halved between the two bodies."""
+        _, apart = self._arms(bodies)
+        half = 0.25 * self.stiffness * dot(apart, apart)
+        shares = jnp.concatenate([half, half], axis=-1)[..., None]
+        return self._gathered(shares, bodies)[..., 0]
+
+    def error(self, bodies: RigidBodies) -> Float[Array, "*scenes joints"]:
+        """How far the two points of each joint are apart [m]."""
+        return norm(self._arms(bodies)[1])
+
+    def _arms(self, bodies: RigidBodies) -> tuple[list[Array], Array]:
+        """From the centres of mass to the points of each joint, and from its first point to its second."""
+        places = [self._ends(part) for part in (bodies.position, bodies.orientation)]
+        arms = []
+        for side, (position, orientation) in enumerate(zip(*places, strict=True)):
+            ends = RigidBodies(position, orientation, position, position)
+            arms.append(in_world(ends, jnp.broadcast_to(self.points[:, side], position.shape)))
+        return arms, places[0][1] + arms[1] - places[0][0] - arms[0]
+
+    def _ends(self, part: Array) -> list[Array]:
+        return [jnp.take(part, np.array([pair[side] for pair in self.pairs]), axis=-2) for side in (0, 1)]
+
+    def _gathered(self, ends: Array, bodies: RigidBodies) -> Array:
+        """What acts on the ends of joints, first ones then second ones, summed up body by body: gathered, not scattered."""
+        bodies_of = np.asarray(self.pairs).T.ravel()
+        nodes = bodies.lanes[-1]
+        slots = [np.flatnonzero(bodies_of == node) for node in range(nodes)]
+        padded = jnp.concatenate([ends, jnp.zeros_like(ends[..., :1, :])], axis=-2)
+        none = len(bodies_of)
+        total = jnp.zeros((*ends.shape[:-2], nodes, ends.shape[-1]), ends.dtype)
+        for place in range(max(map(len, slots))):
+            index = np.array([slot[place] if place < len(slot) else none for slot in slots])
+            total = total + jnp.take(padded, index, axis=-2)
+        return total
+
+
+def hinge(pair: tuple[int, int], points: Any, axis: Any, width: float) -> tuple[list, np.ndarray]:
+    """Pairs and points of a hinge for `Joints`: two ball joints a `width` [m] apart on an axis that both bodies share.
+
+    `points` `(2, 3)` is its middle in each body's frame, `axis` its direction in both frames, or `(2, 3)`, one in each.
+
+    Example:
+        >>> pairs, points = rigid.hinge((0, 1), [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], axis=(0.0, 0.0, 1.0), width=0.5)
+        >>> pairs, points.shape
+        ([(0, 1), (0, 1)], (2, 2, 3))
+    """
+    points, axis = np.broadcast_to(points, (2, 3)), np.broadcast_to(axis, (2, 3))
+    size = np.sqrt(np.sum(axis * axis, axis=-1, keepdims=True))
+    if not (size > 0).all() or width <= 0:
+        raise ValueError(f"hinge: got axis {axis.tolist()} and width {width}, expected a direction and a width > 0.")
+    half = width / 2 * axis / size
+    return [pair, pair], np.stack([points - half, points + half])

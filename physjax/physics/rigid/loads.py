@@ -1,0 +1,245 @@
+"""Rigid bodies: how they begin, what acts on them, and how their points move.
+
+    from physjax import RigidBodies, Scene, forces, inertia, rigid
+
+    brick = inertia.box(2.0, size=(0.3, 0.1, 0.2))
+    thrown = Scene(rigid.bodies(brick, velocity=(5, 3, 0), angular_velocity=(0, 1, 9)), brick, (forces.Gravity(),))
+
+Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
+inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
+`Hull`; `contacts=(Touch(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.checks import quantity, real_quantity
+from physjax.loops import Time
+from physjax.particles import Particles
+from physjax.parts import Force, as_module
+from physjax.physics.rigid.inertia import Inertia, real_turn
+from physjax.physics.rigid.spatial import (
+    Load,
+    OnBodies,
+    RigidBodies,
+    Wrench,
+    angular_acceleration,
+    angular_velocity,
+    in_world,
+)
+from physjax.scene import Scene
+from physjax.vectors import cross, over, scale, turn, turn_back
+
+
+def bodies(
+    inertia: Inertia,
+    position: Any = (0.0, 0.0, 0.0),
+    orientation: Any = (1.0, 0.0, 0.0, 0.0),
+    velocity: Any = (0.0, 0.0, 0.0),
+    angular_velocity: Any = (0.0, 0.0, 0.0),
+    *,
+    frame: str = "world",
+) -> RigidBodies:
+    """Bodies that begin with these velocities: p = m v, L = R I Rᵀ ω.
+
+    Vectors are `(3,)` for all or one per lane, `(*lanes, 3)`; the orientation is a quaternion (w, x, y, z) of any length,
+    the real part first: (1, 0, 0, 0) is not turned. The angular velocity [rad/s] is in the `frame` of the "world" or the
+    "body". On a pivot the velocity follows from it. The float type is the position's.
+
+    Example:
+        >>> turning = rigid.bodies(brick, angular_velocity=(0.0, 0.0, 2.0))
+        >>> print(turning.angular_momentum)
+        [ 0.  0. 10.]
+    """
+    _demand_frame(frame)
+    named = {"position [m]": position, "velocity [m/s]": velocity, "angular velocity [rad/s]": angular_velocity}
+    x, v, omega = (real_quantity(name, value) for name, value in named.items())
+    q = real_turn("orientation", orientation)
+    if any(a.shape[-1:] != (3,) for a in (x, v, omega)):
+        raise ValueError(f"bodies: got vectors of shapes {x.shape}, {v.shape}, {omega.shape}, expected (*lanes, 3).")
+    parts = (x[..., 0], v[..., 0], omega[..., 0], q[..., 0], inertia.mass, inertia.principal[..., 0])
+    lanes, dtype = jnp.broadcast_shapes(*(part.shape for part in parts)), x.dtype
+    x, v, omega, q = (jnp.broadcast_to(a, (*lanes, a.shape[-1])).astype(dtype) for a in (x, v, omega, q))
+    inertia = inertia.checked(lanes, dtype)
+    omega = omega if frame == "body" else turn_back(q, omega)
+    axes = None if inertia.axes is None else over(inertia.axes, q)
+    along = omega if axes is None else turn_back(axes, omega)
+    spin = over(inertia.principal, omega) * along
+    return RigidBodies(x, q, scale(inertia.mass, v), turn(q, spin if axes is None else turn(axes, spin)))
+
+
+def on_bodies(function: Callable, *, couples: bool = False) -> Load:
+    """A plain function `(t, bodies, inertia) -> Wrench` as a load; say if one body's load depends on another.
+
+    Example:
+        >>> spin_up = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(torque=0.5 * bodies.angular_momentum))
+        >>> print(loads(Scene(body, brick, (spin_up,)), 0.0).torque)
+        [0. 0. 5.]
+    """
+    return OnBodies(function, couples)
+
+
+# points of a body
+
+
+def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
+    """Where a point of each body is [m]: x + R p.
+
+    Example:
+        >>> print(rigid.point(body, (0.5, 0.0, 0.0)))
+        [0.5 0.  0. ]
+    """
+    return bodies.position + in_world(bodies, place)
+
+
+def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> Float[Array, "*lanes 3"]:
+    """How fast a point of each body is [m/s]: v + ω × r.
+
+    Example:
+        >>> print(rigid.point_velocity(body, brick, (0.5, 0.0, 0.0)))
+        [1. 1. 0.]
+    """
+    return scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), in_world(bodies, place))
+
+
+def point_acceleration(
+    scene: Scene, t: ArrayLike, place: ArrayLike, state: RigidBodies | None = None
+) -> Float[Array, "*lanes 3"]:
+    """Acceleration of a point of each body [m/s²]: a + ω̇ × r + ω × (ω × r), at `scene.state` unless a state is given.
+
+    Example:
+        >>> print(rigid.point_acceleration(Scene(body, brick), 0.0, (0.5, 0.0, 0.0)))
+        [-2.  0.  0.]
+    """
+    state = scene.state if state is None else state
+    rate, r = scene.rate(t, state), in_world(state, place)
+    omega, change = angular_velocity(state, scene.mass), angular_acceleration(state, scene.mass, rate.angular_momentum)
+    return scale(1 / scene.mass.mass, rate.momentum) + cross(change, r) + cross(omega, cross(omega, r))
+
+
+# loads
+
+
+class Torque(Load):
+    """A torque [N m], in the frame of the "world" or of the "body".
+
+    Example:
+        >>> print(loads(Scene(body, brick, (rigid.Torque((0.0, 0.0, 5.0)),)), 0.0).torque)
+        [0. 0. 5.]
+    """
+
+    torque: Float[Array, "..."] = quantity("torque", "N m", kind="vector")
+    frame: str = eqx.field(static=True, default="world")
+
+    def __check_init__(self):
+        _demand_frame(self.frame)
+
+    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+        """No force, the torque."""
+        world = self.frame == "world"
+        return Wrench(torque=over(self.torque, bodies.position) if world else in_world(bodies, self.torque))
+
+
+class RotationalDrag(Load):
+    """What a fluid takes from a turning body: τ = -c ω, c [N m s]; of a ball in creeping flow c = 8πηr³.
+
+    Example:
+        >>> brake = rigid.RotationalDrag(0.5)
+        >>> print(loads(Scene(body, brick, (brake,)), 0.0).torque)
+        [-0. -0. -1.]
+    """
+
+    coefficient: Float[Array, "..."] = quantity("drag coefficient c", "N m s", at_least=0)
+
+    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+        """No force, the torque."""
+        return Wrench(torque=scale(-self.coefficient, angular_velocity(bodies, inertia)))
+
+
+class Thrust(Load):
+    """A force [N] that turns with the body, at a `point` [m] of it: an engine. F = R f, τ = r × F.
+
+    Example:
+        >>> engine = rigid.Thrust((3.0, 0.0, 0.0), point=(0.0, 2.0, 0.0))
+        >>> print(*loads(Scene(body, brick, (engine,)), 0.0))
+        [3. 0. 0.] [ 0.  0. -6.]
+    """
+
+    force: Float[Array, "..."] = quantity("thrust", "N", kind="vector")
+    point: Float[Array, "..."] = quantity("point of the body", "m", kind="place", default=(0.0, 0.0, 0.0))
+
+    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+        """The force and its torque."""
+        force = in_world(bodies, self.force)
+        return Wrench(force, cross(in_world(bodies, self.point), force))
+
+
+class AtPoint(Load):
+    """Any force on particles, at a `point` [m] of each body: it sees where that is and how fast, and τ = r × F.
+
+    A spring to the world is `AtPoint(point, forces.Anchor(...))`, a spring between points of two bodies
+    `AtPoint(points, springs.Springs(pairs, ...))` with a point for each lane, a kick off centre `AtPoint(point,
+    forces.Kick(...))`. What remembers (springs that break) cannot be so placed.
+
+    Example:
+        >>> off_center = rigid.AtPoint((0.0, 1.0, 0.0), forces.Constant((6.0, 0.0, 0.0)))
+        >>> print(loads(Scene(body, brick, (off_center,)), 0.0).torque)
+        [ 0.  0. -6.]
+    """
+
+    point: Float[Array, "..."] = quantity("point of the body", "m", kind="place")
+    force: Force = eqx.field(converter=as_module)
+
+    def __check_init__(self):
+        if isinstance(self.force, Load) or hasattr(self.force, "advance"):
+            raise TypeError(f"AtPoint: got {type(self.force).__name__}, expected a force on particles that forgets.")
+
+    @property
+    def couples(self) -> bool:
+        """Whether the force ties bodies together."""
+        return getattr(self.force, "couples", True)
+
+    @property
+    def sees_moments(self) -> bool:
+        """Whether the force asks for the time as a moment."""
+        return getattr(self.force, "sees_moments", False)
+
+    @property
+    def discontinuities(self) -> Callable:
+        """Times at which the force jumps [s], where it does."""
+        return self.force.discontinuities
+
+    @property
+    def during(self) -> Callable:
+        """The mean of the force over a step, where it has one; it looks at when, not at how fast."""
+        mean = self.force.during
+
+        def placed(t, dt, bodies):
+            where = point(bodies, self.point)
+            return AtPoint(self.point, mean(t, dt, Particles(where, jnp.zeros_like(where))))
+
+        return placed
+
+    @property
+    def potential(self) -> Callable:
+        """Its energy [J], where it has one."""
+        energy = self.force.potential
+        return lambda t, bodies, inertia: energy(t, self._seen(bodies, inertia), inertia.mass)
+
+    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+        """The force and its torque."""
+        force = self.force(t, self._seen(bodies, inertia), inertia.mass)
+        return Wrench(force, cross(in_world(bodies, self.point), force))
+
+    def _seen(self, bodies: RigidBodies, inertia: Inertia) -> Particles:
+        return Particles(point(bodies, self.point), point_velocity(bodies, inertia, self.point))
+
+
+def _demand_frame(frame: str) -> None:
+    if frame not in ("world", "body"):
+        raise ValueError(f"frame: got {frame!r}, expected 'world' or 'body'.")

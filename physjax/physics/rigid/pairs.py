@@ -1,0 +1,125 @@
+"""Rigid balls that hit each other: every pair, one after the other, at the end of a step."""
+
+from itertools import combinations
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.backend import any_lane
+from physjax.checks import concrete, demand_legal, quantity
+from physjax.parts import Contact
+from physjax.physics.contacts.restitution import Coulomb
+from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.spatial import RigidBodies
+from physjax.vectors import cross, dot, norm, scale, unit
+
+ROUNDS = 16
+"""Most passes over all pairs in a step: a push goes through a row of so many balls."""
+MOST = 64
+"""Balls in one scene: their pairs are looked at one by one."""
+
+
+class Balls(Contact):
+    """Balls that may not pass each other: restitution K_r, and Coulomb's friction, which makes them spin.
+
+    All balls of the last lane axis, each pair that overlaps and approaches: u' = -K_r u along the line of centres, and
+    across it at most μ_k times that impulse, and at most what stops the slip. Between balls the two are independent, so
+    that this never adds energy. Momentum is kept. Overlap is then taken away, the common centre of mass kept. First
+    order in dt, with the step shared: take steps in which no ball moves more than a part of its radius. At most 64
+    balls; no stacks.
+
+    Example:
+        >>> marble = inertia.sphere(1.0, 0.5)
+        >>> row = rigid.bodies(marble, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], velocity=[[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        >>> hit = Scene(row, marble, contacts=(rigid.Balls(0.5),)).step(methods.euler, 0.0, 0.01)
+        >>> print(hit.state.momentum[:, 0])
+        [0. 2.]
+    """
+
+    couples: ClassVar[bool] = True
+    radius: Float[Array, "..."] = quantity("radius", "m", above=0)
+    restitution: Float[Array, "..."] = quantity("restitution K_r", "1", at_least=0, at_most=1, default=1.0)
+    coulomb: Coulomb | None = None
+
+    def demand_fit(self, state: Any, mass: Any) -> None:
+        """Raise a TypeError for a state that is not of rigid bodies, a ValueError for what are not balls side by side."""
+        if not isinstance(state, RigidBodies):
+            raise TypeError(f"Balls: got a state of type {type(state).__name__}, expected RigidBodies.")
+        if len(state.lanes) < 1 or not 2 <= state.lanes[-1] <= MOST:
+            raise ValueError(f"Balls: got lanes {state.lanes}, expected 2 to {MOST} balls in the last axis.")
+        demand_legal(self, state)
+        moments = concrete(mass.principal)
+        if moments is not None and np.ptp(moments, axis=-1).max() > 1e-6 * moments.max():
+            raise ValueError("Balls: got bodies with different principal moments, expected inertia.sphere.")
+
+    def gap(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
+        """Distance of each ball to its nearest neighbour [m]."""
+        apart = norm(position[..., :, None, :] - position[..., None, :, :])
+        radius = jnp.broadcast_to(self.radius, position.shape[:-1])
+        apart = apart - radius[..., :, None] - radius[..., None, :]
+        itself = jnp.broadcast_to(jnp.eye(position.shape[-2], dtype=bool), apart.shape)
+        return jnp.min(jnp.where(itself, jnp.inf, apart), axis=-1)
+
+    def respond(self, t: ArrayLike, state: RigidBodies) -> RigidBodies:
+        """The balls as they are: what they do to each other needs their masses; see `answered`."""
+        return state
+
+    def answered(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> RigidBodies:
+        """The balls after all impacts of a step."""
+
+        def sweep(state):
+            after, _ = lax.scan(lambda state, pair: (self._met(state, mass, pair), None), state, self._pairs(state))
+            return after
+
+        def go_on(carry, _):
+            state, going = carry
+            after = lax.cond(any_lane(going), sweep, lambda state: state, state)
+            changed = jnp.any(after.momentum != state.momentum) | jnp.any(after.position != state.position)
+            return (after, changed), None
+
+        return lax.scan(go_on, (state, jnp.any(self.gap(t, state.position) < 0)), length=ROUNDS)[0][0]
+
+    def _pairs(self, state: RigidBodies) -> Array:
+        """Of each pair, which lanes its two balls are in: `(pairs, 2, nodes)`, ones and zeros."""
+        nodes = state.lanes[-1]
+        return jnp.asarray(np.eye(nodes)[list(combinations(range(nodes), 2))], state.dtype)
+
+    def _met(self, state: RigidBodies, mass: Inertia, pair: Array) -> RigidBodies:
+        """A pair after its impact, if there is one."""
+        x, _, p, spin = state
+        ends = [end.reshape((1,) * (x.ndim - 2) + end.shape) for end in pair]
+        own = lambda number: [  # noqa: E731
+            jnp.sum(end * jnp.broadcast_to(number, state.lanes), axis=-1) for end in ends
+        ]
+        of = lambda vector: [jnp.sum(end[..., None] * vector, axis=-2) for end in ends]  # noqa: E731
+        radius, restitution = own(self.radius), sum(own(self.restitution)) / 2
+        lightness, ease = own(1 / mass.mass), own(mass.inverse[..., 0])
+        (a, b), (pa, pb), (sa, sb) = of(x), of(p), of(spin)
+        line, normal = b - a, unit(b - a)
+        depth = jnp.minimum(norm(line) - radius[0] - radius[1], 0.0)
+        arms = [scale(radius[0], normal), scale(-radius[1], normal)]
+        speeds = [
+            scale(w, momentum) + cross(scale(i, s), arm)
+            for w, momentum, i, s, arm in zip(lightness, (pa, pb), ease, (sa, sb), arms, strict=True)
+        ]
+        u = speeds[1] - speeds[0]
+        inward = jnp.where(depth < 0, jnp.minimum(dot(u, normal), 0.0), 0.0)
+        light = lightness[0] + lightness[1]
+        push = -(1 + restitution) * inward / light
+        impulse = scale(push, normal)
+        if self.coulomb is not None:
+            slip = u - scale(dot(u, normal), normal)
+            size, stiff = norm(slip), light + ease[0] * radius[0] ** 2 + ease[1] * radius[1] ** 2
+            most = sum(own(self.coulomb.kinetic)) / 2 * push
+            share = jnp.where(size > stiff * most, most / jnp.where(size > 0, size, 1.0), 1 / stiff)
+            impulse = impulse - scale(jnp.where(inward < 0, share, 0.0), slip)
+        for end, arm, sign, w in zip(ends, arms, (-1.0, 1.0), lightness, strict=True):
+            give = lambda vector, end=end: end[..., None] * vector[..., None, :]  # noqa: E731
+            p = p + sign * give(impulse)
+            spin = spin + sign * give(cross(arm, impulse))
+            x = x - sign * give(scale(depth * w / light, normal))
+        return RigidBodies(x, state.orientation, p, spin)

@@ -1,0 +1,328 @@
+"""Rigid bodies: their state, how they turn, and what a load does to them.
+
+Quaternions are (w, x, y, z), of length 1, and turn vectors of the body's frame into the world's. Angular momentum is in
+the world's frame, where nothing but a torque changes it: there is no gyroscopic term to forget. The angular velocity is
+ω = R I⁻¹ Rᵀ L, found anew from L wherever it is needed.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from physjax.backend import kept_apart
+from physjax.checks import real_array, real_quantity
+from physjax.loops import Time, told
+from physjax.particles import Particles, added, shaped
+from physjax.parts import Force, Function
+from physjax.physics.rigid.inertia import Inertia, real_turn
+from physjax.scene import loads
+from physjax.vectors import (
+    components,
+    composed,
+    cross,
+    dot,
+    over,
+    reverse,
+    scale,
+    stacked,
+    turn,
+    turned,
+)
+
+
+class Wrench(NamedTuple):
+    """A force [N] and a torque about the centre of mass [N m], in the world's frame; None where there is none.
+
+    Example:
+        >>> push = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(force=2.0 * bodies.momentum))
+        >>> print(loads(Scene(body, brick, (push,)), 0.0).force)
+        [24.  0.  0.]
+    """
+
+    force: Float[Array, "*lanes 3"] | None = None
+    torque: Float[Array, "*lanes 3"] | None = None
+
+
+class Load(Force):
+    """What acts on bodies as bodies: `(t, bodies, inertia) -> Wrench`. Other forces act at the centre of mass.
+
+    Example:
+        >>> isinstance(rigid.Torque((0.0, 0.0, 1.0)), rigid.Load)
+        True
+    """
+
+    @abstractmethod
+    def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
+        """Force [N] and torque about the centre of mass [N m] on each body."""
+
+    def __call__(self, t: Time, state: Any, mass: Any) -> Wrench:
+        """The wrench; a TypeError where there are no bodies."""
+        if not isinstance(state, RigidBodies):
+            raise TypeError(
+                f"{type(self).__name__}: got a state of type {type(state).__name__}, expected RigidBodies: it turns what "
+                "it acts on."
+            )
+        return self.wrench(t, state, mass)
+
+
+class OnBodies(Load):
+    """A plain function `(t, bodies, inertia) -> Wrench` as a load, for each body by itself unless it `couples`."""
+
+    function: Function
+    couples: bool = eqx.field(static=True)
+
+    def __init__(self, function: Callable, couples: bool = False):
+        self.function = Function(function)
+        self.couples = couples
+
+    def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
+        """What the function says."""
+        return self.function(t, bodies, inertia)
+
+
+class RigidBodies(NamedTuple):
+    """Bodies that move and turn in space: position of the centre of mass [m], orientation, momentum, angular momentum.
+
+    Shapes `(*lanes, 3)`, the orientation's `(*lanes, 4)`; momentum [kg m/s] and angular momentum [kg m²/s] about the
+    centre of mass, or, for a body on a pivot, about that. `bodies` builds them from velocities. A scene of them has an
+    `Inertia` for its mass. The orientation is brought to length 1.
+
+    Example:
+        >>> isinstance(body, RigidBodies), body.momentum.tolist(), body.angular_momentum.tolist()
+        (True, [12.0, 0.0, 0.0], [0.0, 0.0, 10.0])
+    """
+
+    position: Float[Array, "*lanes 3"]
+    orientation: Float[Array, "*lanes 4"]
+    momentum: Float[Array, "*lanes 3"]
+    angular_momentum: Float[Array, "*lanes 3"]
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Shape of the lanes: `()` for a single body."""
+        return self.position.shape[:-1]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Floating-point type, which every number of the scene follows."""
+        return self.position.dtype
+
+    @property
+    def place(self) -> np.ndarray:
+        """What the errors of a path are measured by: position [m] and orientation [1] beside each other, `(*lanes, 7)`."""
+        return np.concatenate([self.position, self.orientation], axis=-1)
+
+    # loads
+
+    def shown_to(self, force: Any, mass: Inertia) -> tuple[Any, Any]:
+        """What a force sees: a load the bodies and their inertia, any other particles at the centres of mass."""
+        if isinstance(force, Load):
+            return self, mass
+        return Particles(self.position, scale(1 / mass.mass, self.momentum)), mass.mass
+
+    def load(self, force: Any, t: Time, mass: Inertia) -> Wrench:
+        """What a force does to each body: a wrench, or a force at the centre of mass."""
+        found = force(told(force, t), *self.shown_to(force, mass))
+        found = found if isinstance(found, Wrench) else Wrench(found)
+        return Wrench(*(None if part is None else shaped(force, part, self.position) for part in found))
+
+    def total(self, terms: Any) -> Wrench:
+        """The sum of wrenches, both parts present."""
+        kinds = zip(*terms, strict=True) if terms else ((), ())
+        present = ([part for part in parts if part is not None] for parts in kinds)
+        return Wrench(*(added(parts) if parts else jnp.zeros_like(self.position) for parts in present))
+
+    def driven(self, scene: Any, t: Time) -> Wrench:
+        """Total force and torque; none on bodies that are held."""
+        total = loads(scene, t, self.on_pivot(scene.mass))
+        if scene.held is None:
+            return total
+        free = 1 - scene.held.astype(self.dtype)
+        return Wrench(*(scale(free, part) for part in total))
+
+    # motion
+
+    def rate(self, wrench: Wrench, inertia: Inertia) -> "RigidBodies":
+        """Time derivative: x' = p/m, q' = ½(0, ω)q, p' = F, L' = τ; on a pivot what follows from turning about it."""
+        force, torque = wrench
+        turning = _turning(self, inertia)
+        if inertia.arm is None:
+            return RigidBodies(scale(1 / inertia.mass, self.momentum), turning, force, torque)
+        omega = angular_velocity(self, inertia)
+        arm = in_world(self, inertia.arm)
+        torque = torque + cross(arm, force)
+        velocity = cross(omega, arm)
+        change = angular_acceleration(self, inertia, torque)
+        acceleration = cross(change, arm) + cross(omega, velocity)
+        return RigidBodies(velocity, turning, scale(inertia.mass, acceleration), torque)
+
+    def kick(self, rate: "RigidBodies", dt: ArrayLike) -> "RigidBodies":
+        """p += F dt, L += τ dt, position and orientation untouched."""
+        momentum = self.momentum + scale(dt, rate.momentum)
+        return RigidBodies(
+            self.position, self.orientation, momentum, self.angular_momentum + scale(dt, rate.angular_momentum)
+        )
+
+    def drift(self, dt: ArrayLike, inertia: Inertia) -> "RigidBodies":
+        """x += p/m dt, and the free turn of a time dt, both momenta untouched."""
+        position = self.position + scale(dt, scale(1 / inertia.mass, self.momentum))
+        return self._replace(position=position, orientation=free_turn(self, inertia, dt)).on_pivot(inertia)
+
+    def held(self, free: Float[Array, "*lanes"]) -> "RigidBodies":
+        """The state with both momenta of held bodies (free = 0) set to zero."""
+        return self._replace(momentum=scale(free, self.momentum), angular_momentum=scale(free, self.angular_momentum))
+
+    def on_pivot(self, inertia: Inertia) -> "RigidBodies":
+        """The state with position and momentum as orientation and angular momentum say, where there is a pivot."""
+        if inertia.arm is None:
+            return self
+        arm = in_world(self, inertia.arm)
+        velocity = cross(angular_velocity(self, inertia), arm)
+        return self._replace(position=over(inertia.pivot, self.position) + arm, momentum=scale(inertia.mass, velocity))
+
+    def settled(self, inertia: Inertia) -> "RigidBodies":
+        """The state with the orientation of length 1, and on its pivot, where there is one.
+
+        Done at the end of a step and not in its stages, which keeps every method's order.
+        """
+        q = self.orientation
+        return self._replace(orientation=scale(1 / jnp.sqrt(dot(q, q)), q)).on_pivot(inertia)
+
+    # what is conserved
+
+    def kinetic_energy(self, inertia: Inertia) -> Float[Array, "*lanes"]:
+        """½p²/m + ½ω·L [J]; on a pivot ½ω·L is all of it."""
+        turning = 0.5 * dot(angular_velocity(self, inertia), self.angular_momentum)
+        return turning if inertia.arm is not None else turning + 0.5 / inertia.mass * dot(self.momentum, self.momentum)
+
+    def linear_momentum(self, inertia: Inertia) -> Float[Array, "*lanes 3"]:
+        """p [kg m/s]."""
+        return self.momentum
+
+    def own_spin(self, inertia: Inertia) -> Float[Array, "*lanes 3"]:
+        """Angular momentum about the centre of mass [kg m²/s], also where the state's own is about a pivot."""
+        if inertia.arm is None:
+            return self.angular_momentum
+        arm = in_world(self, inertia.arm)
+        return self.angular_momentum - cross(arm, self.momentum)
+
+    # checks
+
+    def checked(self, mass: Any) -> tuple["RigidBodies", Inertia]:
+        """State and inertia as arrays of one dtype that fit; ValueError or TypeError in plain words otherwise."""
+        if not isinstance(mass, Inertia):
+            raise TypeError(
+                f"mass: got {type(mass).__name__}, expected an Inertia for rigid bodies, e.g. inertia.box(2.0, (1, 2, 3))."
+            )
+        state = RigidBodies(*(real_array(name, a) for name, a in zip(self._fields, self, strict=True)))
+        lanes, dtype = state.lanes, state.dtype
+        for name, array in state._asdict().items():
+            expected = (*lanes, 4 if name == "orientation" else 3)
+            if array.shape != expected or not array.size:
+                raise ValueError(
+                    f"RigidBodies: got {name} of shape {array.shape}, expected {expected}: vectors of space, component "
+                    "last, quaternions (w, x, y, z), all with the lanes of the position. `bodies` fills them up."
+                )
+            if array.dtype != dtype:
+                raise TypeError(f"RigidBodies: got {name} of {array.dtype}, expected {dtype} like position. Cast it.")
+            real_quantity(f"{name}", array)
+        state = RigidBodies(*(a.astype(dtype) for a in state))
+        state = state._replace(orientation=real_turn("orientation", state.orientation))
+        inertia = mass.checked(lanes, dtype)
+        if inertia.arm is not None:
+            pivot = state.position - in_world(state, inertia.arm)
+            inertia = inertia.hung(pivot)
+        return state.on_pivot(inertia), inertia
+
+
+# how bodies turn
+
+
+def in_world(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]:
+    """A vector of each body's frame, one for all or one per lane, in the world's frame: R v."""
+    return turn(bodies.orientation, over(jnp.asarray(vector, bodies.dtype), bodies.position))
+
+
+def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
+    """ω = R I⁻¹ Rᵀ L [rad/s], in the world's frame.
+
+    Example:
+        >>> print(rigid.angular_velocity(body, brick))
+        [0. 0. 2.]
+    """
+    return answer(bodies, inertia, bodies.angular_momentum)
+
+
+def angular_acceleration(
+    bodies: RigidBodies, inertia: Inertia, torque: Float[Array, "*lanes 3"]
+) -> Float[Array, "*lanes 3"]:
+    """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world's frame; the torque [N m] about the centre of mass, or the pivot.
+
+    Example:
+        >>> print(rigid.angular_acceleration(body, brick, torque=jnp.array([0.0, 0.0, 10.0])))
+        [0. 0. 2.]
+    """
+    gyroscopic = cross(angular_velocity(bodies, inertia), bodies.angular_momentum)
+    return answer(bodies, inertia, torque - gyroscopic)
+
+
+def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
+    """The orientation after turning freely for a time dt [s], to second order, with L constant.
+
+    The turns about the principal axes that ½ℓᵢ²/Iᵢ alone would make (ℓ the angular momentum seen from the body), each in
+    closed form, one after the other and back: half, half, whole, half, half. Exactly reversible in time, and no energy
+    is gained or lost in the long run (R. McLachlan 1993, S. Reich 1994).
+    """
+    w, *v = _principal_frame(bodies, inertia)
+    spin = turned(reverse([w, *v]), components(bodies.angular_momentum))
+    inverse = components(over(inertia.inverse, bodies.angular_momentum))
+    for i, share in ((0, 0.25), (1, 0.25), (2, 0.5), (1, 0.25), (0, 0.25)):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        c, s = _cosine_and_sine(scale(dt, share * inverse[i] * spin[i]), dt)
+        w, v[i], v[j], v[k] = w * c - v[i] * s, v[i] * c + w * s, v[j] * c + v[k] * s, v[k] * c - v[j] * s
+        cosine, sine = c * c - s * s, 2.0 * c * s
+        spin[j], spin[k] = cosine * spin[j] + sine * spin[k], cosine * spin[k] - sine * spin[j]
+    return _body_frame([w, *v], bodies, inertia)
+
+
+def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
+    # kept apart: XLA on CPU would compute them again for each of the many that are made of them
+    return kept_apart(dt, lambda: (jnp.cos(angle), jnp.sin(angle)))
+
+
+def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
+    """The quaternion from the principal axes to the world, in components."""
+    q = components(bodies.orientation)
+    return q if inertia.axes is None else composed(q, components(over(inertia.axes, bodies.orientation)))
+
+
+def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
+    """The quaternion whose turn of the principal axes is `frame`."""
+    if inertia.axes is not None:
+        frame = composed(frame, reverse(components(over(inertia.axes, bodies.orientation))))
+    return stacked(frame)
+
+
+def _turning(bodies: RigidBodies, inertia: Inertia) -> Array:
+    """q' = ½ q (0, ω), with ω seen from the body, which is cheaper than ½ (0, ω) q with ω seen from the world."""
+    frame = _principal_frame(bodies, inertia)
+    x, y, z = _seen(frame, inertia, bodies.angular_momentum)
+    return _body_frame(composed(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
+
+
+def _seen(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
+    """I⁻¹ times a vector of the world, along the principal axes."""
+    parts = zip(components(over(inertia.inverse, vector)), turned(reverse(frame), components(vector)), strict=True)
+    return [number * part for number, part in parts]
+
+
+def answer(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
+    """R I⁻¹ Rᵀ times a vector of the world: how a body turns in answer to an angular impulse."""
+    frame = _principal_frame(bodies, inertia)
+    return stacked(turned(frame, _seen(frame, inertia, vector)))

@@ -1,0 +1,233 @@
+"""Nodes and springs in good order: rope, cloth, jelly, bridge, and whatever a mesh describes.
+
+Each returns a `Lattice` at rest. Stiffness [N/m] and damping [kg/s] are those of a single spring; springs whose
+stiffness is None are absent. `mass` [kg] is that of the whole, and each node has its share of length, area or volume.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from physjax.checks import positive_integer, real_quantity
+from physjax.physics.springs.assembly import Lattice, build_lattice, vector_lengths
+from physjax.physics.springs.mesh_sheets import from_mesh
+
+
+def rope(
+    start: Any,
+    end: Any,
+    nodes: int,
+    *,
+    mass: ArrayLike,
+    stiffness: ArrayLike,
+    bend: ArrayLike | None = None,
+    damping: ArrayLike | None = None,
+    length: ArrayLike | None = None,
+    breaks_at: ArrayLike | None = None,
+) -> Lattice:
+    """A rope from `start` to `end` [m], in the plane or in space, with its nodes at equal distances.
+
+    It is as long as the way unless `length` [m] says otherwise; a longer one begins slack. Sets: start, end, ends.
+
+    Example:
+        >>> rope = lattices.rope((0.0, 0.0), (4.0, 0.0), nodes=5, mass=1.0, stiffness=100.0)
+        >>> print(rope.state.position[:, 0], len(rope.springs.pairs))
+        [0. 1. 2. 3. 4.] 4
+    """
+    nodes = positive_integer("nodes", nodes, at_least=2)
+    ends = [np.asarray(real_quantity(name, value)) for name, value in (("start [m]", start), ("end [m]", end))]
+    if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
+        raise ValueError(f"rope: got start {ends[0].shape} and end {ends[1].shape}, expected two points (2,) or (3,).")
+    x = np.linspace(*ends, nodes)
+    way = vector_lengths(ends[1] - ends[0])
+    stretch = 1.0 if length is None else real_quantity("length [m]", length, above=0) / way
+    kinds = [(_tie((nodes,), [(1,)]), stiffness), (_tie((nodes,), [(2,)]), bend)]
+    share = np.ones(nodes)
+    share[[0, -1]] = 0.5
+    index = np.arange(nodes)
+    sets = {"start": index == 0, "end": index == nodes - 1}
+    sets["ends"] = sets["start"] | sets["end"]
+    return build_lattice(x, kinds, damping, breaks_at, mass, share, sets, np.zeros((0, 3), int), (nodes,), stretch)
+
+
+def cloth(
+    width: float,
+    height: float,
+    rows: int,
+    columns: int,
+    *,
+    mass: ArrayLike,
+    structural: ArrayLike,
+    shear: ArrayLike | None = None,
+    bend: ArrayLike | None = None,
+    damping: ArrayLike | None = None,
+    breaks_at: ArrayLike | None = None,
+    corner: Any = (0.0, 0.0, 0.0),
+    across: Any = (1.0, 0.0, 0.0),
+    down: Any = (0.0, -1.0, 0.0),
+) -> Lattice:
+    """A sheet of `width` × `height` [m], `rows` × `columns` nodes: node (i, j) is number i·columns + j.
+
+    Structural springs tie neighbours, shear springs the diagonals, bend springs every other node. The upper left
+    `corner` [m] is node 0; rows run `across`, columns `down`: with down=(0, 0, 1) it lies instead of hanging. Sets: top,
+    bottom, left, right, edge, corners, top_left, top_right, bottom_left, bottom_right.
+
+    Example:
+        >>> sail = lattices.cloth(2.0, 1.0, rows=2, columns=3, mass=0.6, structural=100.0, shear=50.0)
+        >>> len(sail.state.position), len(sail.springs.pairs)
+        (6, 11)
+    """
+    rows, columns = positive_integer("rows", rows, at_least=2), positive_integer("columns", columns, at_least=2)
+    lengths = [float(real_quantity(f"{n} [m]", v, above=0)) for n, v in (("width", width), ("height", height))]
+    across, down, corner = (
+        np.asarray(real_quantity(n, v)) for n, v in (("across", across), ("down", down), ("corner", corner))
+    )
+    if {across.shape, down.shape, corner.shape} != {(3,)}:
+        raise ValueError(
+            f"cloth: got across {across.shape}, down {down.shape} and corner {corner.shape}, expected vectors (3,)."
+        )
+    if vector_lengths(np.cross(across, down)) == 0:
+        raise ValueError(f"cloth: got across {across} and down {down}, expected two different directions.")
+    i, j = (a.ravel() for a in np.indices((rows, columns)))
+    right, below = (a / vector_lengths(a) for a in (across, down))
+    x = corner + np.multiply.outer(j * lengths[0] / (columns - 1), right)
+    x = x + np.multiply.outer(i * lengths[1] / (rows - 1), below)
+    shape = (rows, columns)
+    kinds = [
+        (_tie(shape, [(0, 1), (1, 0)]), structural),
+        (_tie(shape, [(1, 1), (1, -1)]), shear),
+        (_tie(shape, [(0, 2), (2, 0)]), bend),
+    ]
+    sets = {"top": i == 0, "bottom": i == rows - 1, "left": j == 0, "right": j == columns - 1}
+    sets |= {f"{a}_{b}": sets[a] & sets[b] for a in ("top", "bottom") for b in ("left", "right")}
+    sets["edge"] = sets["top"] | sets["bottom"] | sets["left"] | sets["right"]
+    sets["corners"] = (sets["top"] | sets["bottom"]) & (sets["left"] | sets["right"])
+    return build_lattice(
+        x, kinds, damping, breaks_at, mass, _shares(shape), sets, _cells(np.arange(i.size).reshape(shape)), shape
+    )
+
+
+def jelly(
+    size: Sequence[float],
+    nodes: Sequence[int],
+    *,
+    mass: ArrayLike,
+    structural: ArrayLike,
+    shear: ArrayLike | None = None,
+    bend: ArrayLike | None = None,
+    damping: ArrayLike | None = None,
+    breaks_at: ArrayLike | None = None,
+    corner: Any = (0.0, 0.0, 0.0),
+) -> Lattice:
+    """A block of `size` (x, y, z) [m] with so many `nodes` along each side, its lowest corner at `corner` [m].
+
+    Structural springs tie neighbours, shear springs the diagonals of faces and of the cells, bend springs every other
+    node. Sets: left and right (x), bottom and top (y), back and front (z), surface, corners.
+
+    Example:
+        >>> cube = lattices.jelly((1.0, 1.0, 1.0), (2, 2, 2), mass=1.0, structural=100.0)
+        >>> len(cube.state.position), len(cube.springs.pairs)
+        (8, 12)
+    """
+    shape = tuple(positive_integer("nodes", n, at_least=2) for n in nodes)
+    lengths, corner = (
+        np.asarray(real_quantity("size [m]", size, above=0)),
+        np.asarray(real_quantity("corner [m]", corner)),
+    )
+    if (len(shape), lengths.shape, corner.shape) != (3, (3,), (3,)):
+        raise ValueError(f"jelly: got {len(shape)} counts of nodes and size {lengths.shape}, expected three of each.")
+    place = np.indices(shape).reshape(3, -1).T
+    x = corner + place * (lengths / (np.array(shape) - 1))
+    steps = [s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 0)]
+    straight = [s for s in steps if sum(map(abs, s)) == 1]
+    kinds = [
+        (_tie(shape, straight), structural),
+        (_tie(shape, [s for s in steps if s not in straight]), shear),
+        (_tie(shape, [tuple(2 * a for a in s) for s in straight]), bend),
+    ]
+    last = place == np.array(shape) - 1
+    sides = [(place == 0)[:, a] if end == 0 else last[:, a] for a in range(3) for end in (0, 1)]
+    sets = dict(zip(("left", "right", "bottom", "top", "back", "front"), sides, strict=True))
+    at_end = (place == 0) | last
+    sets |= {"surface": at_end.any(axis=1), "corners": at_end.all(axis=1)}
+    number = np.arange(len(x)).reshape(shape)
+    skin = []
+    for axis in range(3):  # outward on both sides
+        low, high = np.take(number, 0, axis), np.take(number, -1, axis)
+        skin += [_cells(low if axis == 1 else low.T), _cells(high.T if axis == 1 else high)]
+    return build_lattice(x, kinds, damping, breaks_at, mass, _shares(shape), sets, np.concatenate(skin), shape)
+
+
+def bridge(
+    span: float,
+    height: float,
+    panels: int,
+    *,
+    mass: ArrayLike,
+    stiffness: ArrayLike,
+    width: float | None = None,
+    damping: ArrayLike | None = None,
+    breaks_at: ArrayLike | None = None,
+) -> Lattice:
+    """A truss over a `span` [m] along x: two chords, posts, and both diagonals in every panel; rigid when pinned at one end.
+
+    With a `width` [m] there are two such trusses side by side, z = 0 and z = width, braced to each other above and
+    below. Mass goes with the length of the beams. Sets: deck (the lower chord), top, left, right, supports (the ends of
+    the deck).
+
+    Example:
+        >>> truss = lattices.bridge(4.0, 1.0, panels=4, mass=100.0, stiffness=2e4)
+        >>> len(truss.state.position), len(truss.springs.pairs), int(truss.nodes["supports"].sum())
+        (10, 21, 2)
+    """
+    panels = positive_integer("panels", panels, at_least=1)
+    sides = [span, height] if width is None else [span, height, width]
+    lengths = np.array([float(real_quantity("span, height and width [m]", side, above=0)) for side in sides])
+    shape = (panels + 1, *[2] * (len(sides) - 1))
+    place = np.indices(shape).reshape(len(shape), -1).T
+    x = place * (lengths / (np.array(shape) - 1))
+    steps = [s for s in product((-1, 0, 1), repeat=len(shape)) if s > (0,) * len(shape)]
+    flat = [s for s in steps if sum(map(abs, s)) <= 2]  # along the edges and across the faces of each box
+    pairs = _tie(shape, flat)
+    along = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]])
+    share = np.bincount(pairs.ravel(), np.repeat(along, 2), len(x))
+    sets = {"left": place[:, 0] == 0, "right": place[:, 0] == panels, "deck": place[:, 1] == 0, "top": place[:, 1] == 1}
+    sets["supports"] = sets["deck"] & (sets["left"] | sets["right"])
+    return build_lattice(x, [(pairs, stiffness)], damping, breaks_at, mass, share, sets, np.zeros((0, 3), int), shape)
+
+
+def _tie(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.ndarray:
+    """Pairs of all nodes of a lattice that are the given steps apart."""
+    number, pairs = np.arange(np.prod(shape)).reshape(shape), []
+    for step in steps:
+        here = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shape, strict=True))
+        there = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, shape, strict=True))
+        if all(abs(s) < n for s, n in zip(step, shape, strict=True)):
+            pairs.append(np.stack([number[here].ravel(), number[there].ravel()], axis=1))
+    return np.concatenate(pairs) if pairs else np.zeros((0, 2), int)
+
+
+def _shares(shape: tuple[int, ...]) -> np.ndarray:
+    """Each node's share of a lattice: half as much at the end of a row, in every direction."""
+    share = np.ones(1)
+    for count in shape:
+        ends = np.ones(count)
+        ends[[0, -1]] = 0.5
+        share = np.multiply.outer(share, ends).ravel()
+    return share
+
+
+def _cells(number: np.ndarray) -> np.ndarray:
+    """Two triangles for each cell of a sheet of nodes."""
+    a, b, c, d = (number[i : i - 1 or None, j : j - 1 or None].ravel() for i in (0, 1) for j in (0, 1))
+    return np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
+
+
+__all__ = ["Lattice", "bridge", "cloth", "from_mesh", "jelly", "rope"]
+
+
+def __dir__() -> list[str]:
+    return __all__

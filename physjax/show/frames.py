@@ -1,0 +1,204 @@
+"""What is looked at: the frames of one scene out of a run, checked before anything is drawn."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from physjax.physics.springs.springs import Springs
+from physjax.trajectory import Trajectory
+
+DAY = 86400.0
+
+
+class Take(NamedTuple):
+    """One scene of a run: `time` (frames,) [s], `position` (frames, nodes, dim) [m], how many frames are `good`, the axis `up`.
+
+    A frame is good until a node is no longer finite; where lanes are independent, until none is.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    good: int
+    surfaces: tuple
+    up: int = 1
+
+    @property
+    def blew_up(self) -> bool:
+        """Whether frames are missing at the end."""
+        return self.good < len(self.time)
+
+    @property
+    def dim(self) -> int:
+        """Number of components."""
+        return self.position.shape[-1]
+
+    def title(self, frame: int) -> str:
+        """The time of a frame, with three figures of the whole duration, and where the run ended if it blew up."""
+        span = max(np.ptp(self.time), 1e-12)
+        unit, size = ("d", DAY) if span > 3 * DAY else ("s", 1.0)
+        decimals = int(np.clip(2 - np.floor(np.log10(span / size)), 0, 12))
+        end = f"\nblew up after t = {self.time[self.good - 1] / size:.3g} {unit}" if self.blew_up else ""
+        return f"t = {self.time[frame] / size:.{decimals}f} {unit}{end}"
+
+
+def take(
+    who: str,
+    film: Any,
+    *,
+    scene: int | Sequence[int] | None = None,
+    nodes: int | None = None,
+    dims: tuple[int, ...] = (2, 3),
+) -> Take:
+    """The frames of one scene: of a batch of scenes `(frames, *scenes, nodes, dim)` the one numbered `scene`.
+
+    `who` is named in errors. Raises TypeError or ValueError for what is no run, has no positions, is a whole batch,
+    has not so many `nodes`, or another dimension than `dims`.
+    """
+    time, position = _frames(who, film)
+    for number in batch_index(who, film, scene):
+        position = position[:, number]
+    if position.ndim != 3:
+        raise ValueError(f"{who}: got positions {position.shape}, expected (frames, nodes, dim): several nodes.")
+    if nodes not in (None, position.shape[1]):
+        raise ValueError(
+            f"{who}: got a film of {position.shape[1]} nodes and a sheet of {nodes}, expected the same number. "
+            "Give the lattice the film's scene was made from."
+        )
+    whole = np.isfinite(position).all(axis=-1).all(axis=-1)
+    return _checked(who, film, time, position, whole, dims)
+
+
+def take_lanes(who: str, film: Any, dims: tuple[int, ...] = (1, 2, 3)) -> Take:
+    """The frames of a run with all its lanes side by side, `(frames, lanes, dim)`."""
+    time, position = _frames(who, film)
+    position = position.reshape(len(position), -1, position.shape[-1])
+    some = np.isfinite(position).all(axis=-1)
+    coupled = film.scene is not None and film.scene.couples and np.ndim(film.ok) == 0
+    return _checked(who, film, time, position, some.all(axis=-1) if coupled else some.any(axis=-1), dims)
+
+
+def batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | None) -> tuple[int, ...]:
+    """The axes of scenes that come before the nodes, and which one is meant."""
+    scenes = film.position.shape[1:-2]
+    index = () if scene is None else tuple(np.atleast_1d(scene).tolist())
+    if len(index) != len(scenes):
+        raise ValueError(
+            f"{who}: got positions {film.position.shape} and scene={scene}, expected the number of one scene of "
+            f"{scenes}: {_example(scenes)}."
+        )
+    for number, count in zip(index, scenes, strict=True):
+        if not -count <= number < count:
+            raise ValueError(f"{who}: got scene={scene}, expected numbers below {scenes}, the batch of this film.")
+    return index
+
+
+def picked(who: str, take: Take, frames: int | Iterable[int] | None, default: int = 3) -> list[int]:
+    """The numbers of the chosen frames, counted from the front; by default so many, evenly over the good ones."""
+    if frames is None:
+        return sorted(set(np.linspace(0, take.good - 1, default).round().astype(int).tolist()))
+    asked = [frames] if isinstance(frames, int | np.integer) else list(frames)
+    count = len(take.time)
+    if not asked or any(isinstance(f, bool) or not isinstance(f, int | np.integer) for f in asked):
+        raise TypeError(
+            f"{who}: got frames={frames!r}, expected whole numbers of frames, e.g. frames=(0, {count - 1})."
+        )
+    for frame in asked:
+        if not -count <= frame < count:
+            raise IndexError(
+                f"{who}: got frame {frame}, expected {-count} to {count - 1}: the film has {count} frames, "
+                f"from t = {take.time[0]:g} to {take.time[-1]:g} s."
+            )
+        if frame % count >= take.good:
+            raise ValueError(
+                f"{who}: got frame {frame}, t = {take.time[frame]:g} s, where the run has blown up; expected at most "
+                f"{take.good - 1}, the last good one. film.first_bad_step tells when it happened; try a smaller dt."
+            )
+    return [int(frame) % count for frame in asked]
+
+
+def springs_of(who: str, given: Any) -> Springs:
+    """The springs of a lattice, or those given themselves; a TypeError for anything else."""
+    springs = getattr(given, "springs", given)
+    if not isinstance(springs, Springs):
+        raise TypeError(
+            f"{who}: got {type(given).__name__}, expected springs.Springs or a lattice that has them, such as "
+            "lattices.bridge(...)."
+        )
+    return springs
+
+
+def unbroken(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...]) -> np.ndarray | None:
+    """Which springs hold at every frame, `(frames, springs)`, as the film remembers; None where none can break."""
+    if springs.breaks_at is None:
+        return None
+    for part in film.parts:
+        if isinstance(part, Springs) and part.network == springs.network:
+            held = np.asarray(part.unbroken)
+            return held[(slice(None), *index[: held.ndim - 2])]
+    raise ValueError(
+        f"{who}: got a film that does not remember which of these springs broke, expected one of a scene with them "
+        "among its forces. If it was loaded from a file, load it with scene=."
+    )
+
+
+def faces_of(who: str, sheet: Any) -> tuple[np.ndarray, int | None]:
+    """Triangles `(faces, 3)` of a lattice and its number of nodes; TypeError or ValueError if it has no faces."""
+    faces = getattr(sheet, "faces", None)
+    if faces is None:
+        raise TypeError(
+            f"{who}: got {type(sheet).__name__}, expected a lattice with faces: from lattices.cloth, jelly or from_mesh."
+        )
+    if len(faces) == 0:
+        raise ValueError(
+            f"{who}: got a lattice without faces, expected a cloth, a jelly or a mesh. plot.springs and animate.springs "
+            "draw ropes and bridges."
+        )
+    return np.asarray(faces), sheet.state.position.shape[-2]
+
+
+def _frames(who: str, film: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Times and positions of a run, one time for all lanes."""
+    if not isinstance(film, Trajectory):
+        raise TypeError(f"{who}: got {type(film).__name__}, expected a film: the Trajectory that simulate returns.")
+    if film.state is None:
+        raise ValueError(
+            f"{who}: got a film that holds .recorded only, expected positions. Simulate without record=, and with "
+            "save_every= if it is too large."
+        )
+    if np.ndim(film.first_step):
+        raise ValueError(
+            f"{who}: got {np.shape(film.first_step)} films out of vmap, expected one. Pick one of them: "
+            "jax.tree.map(lambda leaf: leaf[0], film)."
+        )
+    time, position = np.asarray(film.time, float), np.asarray(film.position)
+    if time.ndim != 1:
+        raise ValueError(
+            f"{who}: got times {time.shape}, a step for each lane, expected one time for all. Simulate with one dt."
+        )
+    return time, position
+
+
+def _checked(who, film, time, position, whole, dims) -> Take:
+    dim = position.shape[-1]
+    if dim not in dims:
+        known = " or ".join(map(str, dims))
+        raise ValueError(
+            f"{who}: got positions with {dim} component{'s' * (dim > 1)}, expected {known}. "
+            f"{'plot.springs and animate.springs draw' if dims == (3,) else 'plot.paths draws'} others."
+        )
+    if not whole[0]:
+        raise ValueError(f"{who}: got a film whose first frame is not finite, expected a start that can be drawn.")
+    good = len(whole) if whole.all() else int(np.argmin(whole))
+    return Take(time, position, good, () if film.scene is None else film.scene.contacts, up_of(film))
+
+
+def up_of(film: Trajectory) -> int:
+    """The axis that is up in a run: its scene's; y where it does not know its scene."""
+    return min(1, film.position.shape[-1] - 1) if film.scene is None else film.scene.up
+
+
+def _example(scenes: tuple[int, ...]) -> str:
+    if not scenes:
+        return "there is only one, so leave scene= out"
+    return f"scene={0 if len(scenes) == 1 else (0,) * len(scenes)}"

@@ -1,0 +1,144 @@
+"""What a run's error is: of its path, its end, its energy, its momentum, what it sinks in, or whatever you look at.
+
+A norm compares a run with the true path at the same moments and gives one number, relative to a size that the true
+path has. `path` is what advice is about unless you ask for another.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from physjax.scene import Scene
+from physjax.stepping.reference import in_dtype
+from physjax.study.energy.quantities import ENERGY, MOMENTUM, Conserved
+
+
+class Norm(NamedTuple):
+    """A way to measure errors: `quantity(scene, times, states)` of a run less that of the true path, over its `size`.
+
+    The quantity is NumPy, `(moments, *units, components)`; `size(scene, times, states)` is that of the true path, a
+    number or one for each unit. The worst moment and unit count.
+    """
+
+    name: str
+    quantity: Callable[[Scene, np.ndarray, Any], np.ndarray]
+    size: Callable[[Scene, np.ndarray, Any], np.ndarray]
+
+    def moments(self, scene: Scene, times: np.ndarray, states: Any, truth: Any, scale: Any = None) -> np.ndarray:
+        """The error at each moment, of the worst unit, `(moments,)`; in parts of `scale` where it is given."""
+        return self.units(scene, times, states, truth, scale).max(axis=1)
+
+    def units(self, scene: Scene, times: np.ndarray, states: Any, truth: Any, scale: Any = None) -> np.ndarray:
+        """The error at each moment of each unit in a row, `(moments, units)`."""
+        off = self.quantity(scene, times, states) - self.quantity(scene, times, truth)
+        with np.errstate(invalid="ignore", over="ignore"):
+            length = np.sqrt(np.sum(off**2, axis=-1))
+        size = self.size(scene, times, truth) if scale is None else np.asarray(scale, float)
+        return (length / np.where(size > 0, size, 1.0)).reshape(len(length), -1)
+
+    def error(self, scene: Scene, times: np.ndarray, states: Any, truth: Any, scale: Any = None) -> float:
+        """The error of a run: at its worst moment."""
+        return float(self.moments(scene, times, states, truth, scale).max())
+
+
+def extent(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+    """How far each lane (or the farthest node of each coupled scene) ever is from where it began."""
+    place = np.asarray(states.place, float)
+    away = np.sqrt(np.sum((place - place[0]) ** 2, axis=-1)).max(axis=0)
+    return away.max(axis=-1, keepdims=True) if scene.couples else away
+
+
+def _place(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+    return np.asarray(states.place, float)
+
+
+def _last_place(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+    return _place(scene, times, states)[-1:]
+
+
+@partial(jax.jit, static_argnames="function")
+def _over_time(function: Callable, scene: Scene, times: Any, states: Any) -> Any:
+    return jax.vmap(lambda t, state: function(scene, t, state))(times, states)
+
+
+def _series(function: Callable, scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+    """A function of the state at every moment."""
+    with jax.enable_x64(True):
+        states = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), states)
+        return np.asarray(_over_time(function, in_dtype(scene, jnp.float64), jnp.asarray(times), states))
+
+
+def _kept(conserved: Conserved) -> Norm:
+    """The error of a quantity, relative to the largest size it has on the true path."""
+
+    def value(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+        found = _series(conserved.value, scene, times, states)
+        return found[..., None] if found.ndim == 1 + len(scene.status_shape) else found
+
+    def size(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+        return _series(conserved.size, scene, times, states).max(axis=0)
+
+    return Norm(conserved.name, value, size)
+
+
+def _depth(scene: Scene, t: Any, state: Any) -> Any:
+    """How far each lane has sunk into the contact it is deepest in [m]."""
+    if not scene.contacts:
+        raise ValueError("penetration: the scene has no contacts, so nothing can sink in. Ask for another norm.")
+    # corners of other nodes are looked at only where a contact has them; a gap may have an axis of its own
+    depths = [jnp.maximum(0.0, -contact.gap(t, state.position)) for contact in scene.contacts]
+    deepest = depths[0]
+    for depth in depths[1:]:
+        deepest = jnp.maximum(deepest, depth)
+    return deepest[..., None]
+
+
+path = Norm("path", _place, extent)
+"""Largest distance from the true path at any moment, in parts of how far the true path goes."""
+final = Norm("final", _last_place, extent)
+"""The same at the last moment alone."""
+energy = _kept(ENERGY)
+"""Total energy against the true path's, in parts of the largest kinetic energy."""
+momentum = _kept(MOMENTUM)
+"""Total momentum against the true path's, in parts of the largest Σm|v|."""
+penetration = Norm("penetration", partial(_series, _depth), extent)
+"""How far anything sinks into a contact, less what it does on the true path, in parts of how far that goes."""
+
+
+def outcome(function: Callable, name: str | None = None) -> Norm:
+    """What you look at: `function(times, states) -> number or array`; its error in parts of its own largest value.
+
+    Example:
+        >>> accuracy.outcome(lambda times, states: states.position[-1, 0], name="where it lands").name
+        'where it lands'
+    """
+    if not callable(function):
+        raise TypeError(f"outcome: got {function!r}, expected a function (times, states) -> what you look at.")
+
+    def value(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+        return np.asarray(function(times, states), float).reshape(1, 1, -1)
+
+    return Norm(
+        name or getattr(function, "__name__", "outcome"),
+        value,
+        lambda scene, times, states: np.abs(value(scene, times, states)).max(),
+    )
+
+
+NORMS = (path, final, energy, momentum, penetration)
+"""The norms that every scene has (the last one only with contacts)."""
+
+
+def as_norm(norm: Any) -> Norm:
+    """A norm, or a function (times, states) of the user's as one."""
+    if isinstance(norm, Norm):
+        return norm
+    if not callable(norm):
+        raise TypeError(
+            f"norm: got {norm!r}, expected one of study.norms, such as path, or a function (times, states) -> outcome."
+        )
+    return outcome(norm)

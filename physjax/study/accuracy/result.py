@@ -1,0 +1,186 @@
+"""The result of a work-precision study: every run, what it says about each method, as table, CSV and picture."""
+
+import csv
+import math
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from physjax.files import replacing
+from physjax.show.style import PROJECTED
+from physjax.text import seconds_text, table
+
+ERRORS = (1e-2, 1e-4, 1e-6)
+"""Errors (relative to the extent of the path) for which the fastest method is named."""
+
+
+EXACT = 1e-10
+"""A truth whose own error is larger than this cannot say of a run that it is exact."""
+
+
+class Run(NamedTuple):
+    """One run of one method. Errors are relative to the extent of the path; `drifts` to the size of the conserved quantity.
+
+    `dt` [s] is None for what chooses its own steps, `tolerance` is None for fixed steps. `errors` are those in the norms
+    that were asked for. `seconds` is the least and
+    `seconds_median` the median of several timings, compiling apart.
+
+    Example:
+        >>> chart = accuracy.work_precision(swing, [methods.verlet], [1 / 16, 1 / 32], duration=2.0, rivals=())
+        >>> isinstance(chart.runs[0], accuracy.Run), chart.runs[0].dt, chart.runs[0].evaluations
+        (True, 0.0625, 64)
+    """
+
+    method: str
+    dt: float | None
+    tolerance: float | None
+    steps: int
+    evaluations: int
+    seconds: float
+    seconds_median: float
+    compile_seconds: float
+    final_error: float
+    path_error: float
+    drifts: tuple[float, ...]
+    errors: tuple[float, ...] = ()
+    dtype: str = "float64"
+
+    @property
+    def status(self) -> str:
+        """`ok`; `not finite`; or `off the path`: wrong by more than the path is long."""
+        if not math.isfinite(self.path_error):
+            return "not finite"
+        return "ok" if self.path_error <= 1.0 else "off the path"
+
+
+class WorkPrecision(NamedTuple):
+    """All runs of a scene under its methods and rivals, their truth, and that truth's own error (`floor`).
+
+    `scattered`: touches are answered, or springs part, at the end of a step, under every method. `horizon` [s] is when
+    rounding has grown to a hundredth of the path; infinite without chaos. Times are those of `batch` copies, errors in
+    `gradients` those of the derivative by the start.
+
+    Example:
+        >>> chart = accuracy.work_precision(swing, [methods.verlet], [1 / 16, 1 / 32], duration=2.0, rivals=())
+        >>> isinstance(chart, accuracy.WorkPrecision), chart.promised
+        (True, {'verlet': 2.0})
+    """
+
+    name: str
+    runs: tuple[Run, ...]
+    promised: dict[str, float]
+    truth: str
+    floor: float
+    duration: float
+    conserved: tuple[str, ...]
+    dtype: str
+    path: tuple[np.ndarray, np.ndarray]
+    scattered: bool = False
+    norms: tuple[str, ...] = ()
+    horizon: float = math.inf
+    batch: int = 1
+    gradients: tuple[Run, ...] = ()
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods and rivals, in the order they ran."""
+        return tuple(dict.fromkeys(run.method for run in self.runs))
+
+    def of(self, method: str) -> tuple[Run, ...]:
+        """The runs of one method, from coarse to fine."""
+        return tuple(run for run in self.runs if run.method == method)
+
+    def observed_order(self, method: str) -> float:
+        """Slope of log error against log dt over the finest runs above rounding; inf if all is rounding, NaN if unknown.
+
+        Over all runs above rounding where contacts are projected or springs part: those errors scatter with where in a
+        step it happens to fall. The truth's own error counts as rounding, but tells of no run that it is exact.
+        """
+        runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
+        resolved = [run for run in runs if self._rounding(run) < run.path_error < 0.05]
+        if runs and all(run.path_error <= self._rounding(run) for run in runs):
+            return float("inf") if self.floor <= EXACT else float("nan")
+        scattered = self.scattered or method.endswith(PROJECTED)
+        finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt or scattered]
+        errors = [run.path_error for run in finest]
+        # what scatters says nothing unless it falls by much
+        if len(finest) < 3 or (scattered and max(errors) < 10 * min(errors)):
+            return float("nan")
+        return float(np.polyfit(np.log([r.dt for r in finest]), np.log(errors), 1)[0])
+
+    def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
+        """The run with the least time whose path error stays below `error`; None if none does."""
+        return _cheapest([run for run in self.runs if rivals or run.tolerance is None], error)
+
+    @property
+    def front(self) -> tuple[Run, ...]:
+        """Pareto's front: the runs that no other beats in both time and error, from fast to accurate."""
+        front: list[Run] = []
+        for run in sorted((run for run in self.runs if run.status == "ok"), key=lambda run: run.seconds):
+            if not front or run.path_error < front[-1].path_error:
+                front.append(run)
+        return tuple(front)
+
+    def table(self) -> str:
+        """A line for each method: order promised and seen, its least time to each of `ERRORS`, and where it failed."""
+        headers = ["method", "order", "seen", *(f"to {e:.0e}" for e in ERRORS), "fails at dt", "compile"]
+        rows = []
+        for method in self.methods:
+            runs = self.of(method)
+            cheapest = [_cheapest(runs, error) for error in ERRORS]
+            failed = [run.dt for run in runs if run.dt is not None and run.status != "ok"]
+            rows.append(
+                [
+                    method,
+                    _number(self.promised.get(method), ".0f"),
+                    _order(self.observed_order(method)) if method in self.promised else "-",
+                    *(seconds_text(run.seconds) if run else "-" for run in cheapest),
+                    seconds_text(min(failed)) if failed else "-",
+                    seconds_text(runs[0].compile_seconds),
+                ]
+            )
+        return table(headers, rows)
+
+    def to_csv(self, path: str | os.PathLike) -> None:
+        """Write every run as one line of a CSV file; whole or absent."""
+        fields = [name for name in Run._fields if name not in ("drifts", "errors")]
+        with replacing(path) as file:
+            writer = csv.writer(file)
+            writer.writerow(
+                [
+                    "scene",
+                    *fields,
+                    *(f"drift of {name}" for name in self.conserved),
+                    *(f"error of {name}" for name in self.norms),
+                    "status",
+                    "truth",
+                    "floor",
+                ]
+            )
+            for run in self.runs:
+                numbers = [getattr(run, name) for name in fields]
+                writer.writerow([self.name, *numbers, *run.drifts, *run.errors, run.status, self.truth, self.floor])
+
+    def plot(self, figure: Any = None) -> Any:
+        """Draw the study: the path, error against time, error against step, and drift or cost. Returns the matplotlib figure."""
+        from physjax.study.accuracy.chart import draw_work_precision
+
+        return draw_work_precision(self, figure)
+
+    def _rounding(self, run: Run) -> float:
+        """Errors below this are rounding, or the truth's own."""
+        return max(10 * self.floor, 100 * float(np.finfo(run.dtype).eps) * math.sqrt(run.steps))
+
+
+def _cheapest(runs: Sequence[Run], error: float) -> Run | None:
+    return min((run for run in runs if run.path_error <= error), key=lambda run: run.seconds, default=None)
+
+
+def _order(order: float) -> str:
+    return "exact" if math.isinf(order) else _number(order, ".2f")
+
+
+def _number(value: float | None, spec: str) -> str:
+    return "-" if value is None or math.isnan(value) else format(value, spec)

@@ -1,0 +1,183 @@
+"""The ledger of a run: what every store and every cause received of its energy, momentum and angular momentum."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from physjax.scene import Scene, project
+from physjax.study.energy.audit import LEGS, NUMERICAL, booked, causes
+from physjax.text import table
+from physjax.trajectory import Trajectory
+
+UNITS = {"energy": "J", "momentum": "kg m/s", "angular momentum": "kg m²/s"}
+SUBSTEPS, MOST = 2, 512
+"""Steps of order 8 for one of the run, at first and at most."""
+SETTLED = 1e-11
+"""The exact motion is exact enough when twice the substeps change no entry by more than this part of the largest."""
+
+
+class Account(NamedTuple):
+    """What each store and each cause has `received` of one quantity since the start, frame by frame.
+
+    `received[name]` is `(frames, *status)` in `unit`, with the components last for vectors; `status` is per lane, or per
+    scene where lanes are coupled. Stores are "kinetic" and "potential of ..." (of a momentum: "scene"); everything else
+    is a cause: a force has received what it took by its work (if it has a potential, only what that does not account
+    for), a contact what an impact lost. A negative entry has given. All entries sum to zero, but for `gap`. `size` is the
+    quantity's own: kinetic energy, Σm|v|, Σm|r||v|.
+    """
+
+    unit: str
+    received: dict[str, np.ndarray]
+    size: np.ndarray
+
+    @property
+    def totals(self) -> dict[str, np.ndarray]:
+        """What each has received at the end."""
+        return {name: series[-1] for name, series in self.received.items()}
+
+    @property
+    def gap(self) -> np.ndarray:
+        """The sum of all entries, which would be zero in exact arithmetic, frame by frame."""
+        return sum(self.received.values())
+
+    @property
+    def closing(self) -> float:
+        """The largest gap in parts of the largest entry, or of the `size`: kinetic energy, Σm|v|, Σm|r||v|."""
+        largest = max([float(np.abs(series).max()) for series in self.received.values()] + [float(self.size.max())])
+        return float(np.abs(self.gap).max()) / largest if largest else 0.0
+
+
+class Ledger(NamedTuple):
+    """Where energy, momentum and angular momentum of a run went. Printed, it is a table of the totals over all lanes.
+
+    `time` [s] is of the frames. `angular_momentum`, about the origin, is None in one dimension. `substeps` of order 8
+    followed the exact motion through each step; `unsettled` is by how much fewer of them would change the largest entry.
+    """
+
+    time: np.ndarray
+    method: str
+    energy: Account
+    momentum: Account
+    angular_momentum: Account | None
+    substeps: int
+    unsettled: float
+
+    @property
+    def accounts(self) -> dict[str, Account]:
+        """The accounts by the name of their quantity."""
+        kept = {"energy": self.energy, "momentum": self.momentum, "angular momentum": self.angular_momentum}
+        return {name: account for name, account in kept.items() if account is not None}
+
+    def __str__(self) -> str:
+        labels = list(dict.fromkeys(name for account in self.accounts.values() for name in account.received))
+        headers, columns = ["received by", *(f"{name} [{a.unit}]" for name, a in self.accounts.items())], []
+        for account in self.accounts.values():
+            totals = account.totals | {"sum": account.gap[-1]}
+            columns.append([_text(account, totals.get(label)) for label in (*labels, "sum")])
+        rows = [[label, *cells] for label, *cells in zip((*labels, "sum"), *columns, strict=True)]
+        span = f"{float(np.max(self.time[-1] - self.time[0])):.6g} s of {self.method}"
+        return f"{span}; {NUMERICAL}: what the method made itself\n{table(headers, rows)}"
+
+    def plot(self, figure: Any = None) -> Any:
+        """Draw the energy over time and its totals; returns the matplotlib figure."""
+        from physjax.study.energy.chart import draw_energy_budget
+
+        return draw_energy_budget(self, figure)
+
+
+def _text(account: Account, total: np.ndarray | None) -> str:
+    """A total over all lanes, component by component."""
+    if total is None:
+        return ""
+    parts = over_lanes(account, total)
+    return ", ".join(f"{part:.4g}" for part in np.atleast_1d(parts))
+
+
+def over_lanes(account: Account, amounts: np.ndarray) -> np.ndarray:
+    """Amounts without the axis of frames, summed over all lanes; the components of a vector stay."""
+    lanes = account.size.ndim - 1
+    return amounts.sum(axis=tuple(range(lanes))) if lanes else amounts
+
+
+def closed_books(run: Trajectory, scene: Scene | None = None) -> Ledger:
+    """See `energy.ledger`."""
+    if not isinstance(run, Trajectory):
+        raise TypeError(f"ledger: got a {type(run).__name__}, expected the Trajectory that simulate returns.")
+    if scene is not None:
+        run = eqx.tree_at(lambda run: run.scene, run, scene, is_leaf=lambda leaf: leaf is None)
+    if run.scene is None or run.stepper is None or run.state is None:
+        raise ValueError(
+            "ledger: got a run that does not know its scene, its method or its states. Give scene=, simulate without "
+            "record=, and load with method=; a reference has no method whose share could be told."
+        )
+    if run.scene.emitter is not None:
+        raise ValueError(
+            "ledger: got a scene with an emitter, expected one without: particles bring energy when they are born and take "
+            "it when they die."
+        )
+    for contact in run.scene.contacts:
+        if (contact.response or project) not in (*LEGS, project):
+            raise ValueError(
+                f"ledger: {type(contact).__name__} has a response of its own, expected one of physjax: what is done to a "
+                "touch must be known."
+            )
+    with jax.enable_x64(True):
+        stock, brought, substeps, unsettled = _settled(run)
+    return _told(run, stock, brought, substeps, unsettled)
+
+
+def _settled(run: Trajectory) -> tuple[Any, Any, int, float]:
+    """The books with as many substeps as change them no more."""
+    substeps = SUBSTEPS
+    stock, before = _audit(run, substeps)
+    while True:
+        substeps *= 2
+        _, brought = _audit(run, substeps)
+        change = max(_change(before, brought, stock, name) for name in stock["amounts"])
+        if not change > SETTLED or substeps >= MOST:
+            return stock, brought, substeps, change
+        before = brought
+
+
+def _audit(run: Trajectory, substeps: int) -> tuple[Any, Any]:
+    return jax.tree.map(np.asarray, booked(run, jnp.asarray(substeps)))
+
+
+def _change(before: Any, brought: Any, stock: Any, name: str) -> float:
+    """The largest change of an entry, in parts of the largest that the quantity has."""
+    largest = np.abs(stock["amounts"][name] - stock["amounts"][name][:1]).max()
+    sums = lambda books, cause: np.cumsum(books[cause][name], axis=0)  # noqa: E731
+    largest = max([largest, stock["sizes"][name].max()] + [np.abs(sums(brought, cause)).max() for cause in brought])
+    change = max(np.abs(sums(brought, cause) - sums(before, cause)).max() for cause in brought)
+    return float(change / largest) if largest else 0.0
+
+
+def _told(run: Trajectory, stock: Any, brought: Any, substeps: int, unsettled: float) -> Ledger:
+    """The accounts, summed up frame by frame; a run that came out of vmap has its axis behind that of the frames."""
+    batched = run.first_step.ndim
+    frames_first = lambda series: np.moveaxis(series, batched, 0) if batched else series  # noqa: E731
+    stock, brought = (jax.tree.map(frames_first, books) for books in (stock, brought))
+    gained = lambda series: series - series[:1]  # noqa: E731
+    accounts = {}
+    for name, amount in stock["amounts"].items():
+        stores = stock["stored"] if name == "energy" else {"scene": amount}
+        received = {store: gained(series) for store, series in stores.items()}
+        for cause in (label for labels in causes(run.scene) for label in labels):
+            total = np.cumsum(brought[cause][name], axis=0)
+            received[cause] = -np.concatenate([np.zeros_like(total[:1]), total])
+        silent = {cause for cause in received if name == "energy" and f"potential of {cause}" in received}
+        largest = max(np.abs(series).max() for series in received.values())
+        received = {n: s for n, s in received.items() if n not in silent or np.abs(s).max() > SETTLED * largest}
+        accounts[name] = Account(UNITS[name], received, stock["sizes"][name])
+    return Ledger(
+        np.asarray(frames_first(np.asarray(run.time, float))),
+        getattr(run.method, "__name__", type(run.method).__name__),
+        accounts["energy"],
+        accounts["momentum"],
+        accounts.get("angular momentum"),
+        substeps,
+        unsettled,
+    )

@@ -1,0 +1,64 @@
+"""A ledger drawn: who received the energy of a run, over time and in the end."""
+
+from typing import Any
+
+import numpy as np
+
+from physjax.show.style import PALETTE
+
+NUMERICAL_COLOUR = "0.15"
+LINES = ("-", "--", ":")
+
+
+def draw_energy_budget(result: Any, figure: Any = None) -> Any:
+    """Energy received over time, and a bar for each total, summed over all lanes; returns the figure."""
+    from matplotlib import pyplot as plt
+
+    time = result.time.reshape(len(result.time), -1)[:, 0]
+    account = result.energy
+    lanes = tuple(range(1, account.size.ndim))
+    series = {name: received.sum(axis=lanes) for name, received in account.received.items()}
+    figure = figure or plt.figure(figsize=(9, 3.2 + 0.42 * len(series)), layout="constrained")
+    over_time, bars = figure.subplots(2, 1, height_ratios=(7, 1 + len(series)))
+    styles = _styles(series)
+    for name, received in series.items():
+        over_time.plot(time, received, label=name, **styles[name])
+    over_time.axhline(0, color="0.7", linewidth=0.8, zorder=0)
+    over_time.set(xlabel="time [s]", ylabel="energy received [J]", xlim=(time[0], time[-1]))
+    over_time.set_title(f"Where the energy went, stepped by {result.method}", fontsize=11)
+    over_time.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _totals(bars, {name: received[-1] for name, received in series.items()}, styles)
+    bars.set_title(
+        f"Totals at {time[-1]:.4g} s; their sum is zero within {account.closing:.0e} of the largest", fontsize=11
+    )
+    return figure
+
+
+def _styles(names: Any) -> dict[str, dict]:
+    """A colour for each entry; the method's own share is black and thick."""
+    colours = [colour for colour in PALETTE if colour != PALETTE[0]]
+    styles = {}
+    for i, name in enumerate(name for name in names if name != "numerical"):
+        styles[name] = {"color": colours[i % len(colours)], "linestyle": LINES[i // len(colours) % len(LINES)]}
+    return styles | {"numerical": {"color": NUMERICAL_COLOUR, "linestyle": "-", "linewidth": 2.2}}
+
+
+def _totals(ax: Any, totals: dict[str, float], styles: dict[str, dict]) -> None:
+    """A bar for each entry with its number, the first on top."""
+    places = np.arange(len(totals))
+    values = np.array(list(totals.values()))
+    ax.barh(places, values, color=[styles[name]["color"] for name in totals], height=0.65)
+    ax.axvline(0, color="0.4", linewidth=0.8)
+    reach = np.abs(values).max() or 1.0
+    for place, value in zip(places, values, strict=True):
+        side = "left" if value >= 0 else "right"
+        ax.text(
+            value + 0.012 * reach * (1 if value >= 0 else -1), place, f"{value:.4g}", ha=side, va="center", fontsize=9
+        )
+    ax.set_yticks(places, list(totals))
+    ax.set(
+        xlabel="energy received [J]",
+        xlim=(min(values.min(), 0.0) - 0.3 * reach, max(values.max(), 0.0) + 0.3 * reach),
+    )
+    ax.invert_yaxis()
+    ax.tick_params(axis="y", length=0)

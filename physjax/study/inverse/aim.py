@@ -1,0 +1,300 @@
+"""Which launch hits the target: both arcs, or the least speed, with any forces, in the plane or in space, through bounces.
+
+```python
+shot = Scene(Particles(start, jnp.zeros(2)), mass=0.145, forces=(forces.Gravity(), forces.QuadraticDrag(4.3e-3, 0.35)))
+aimed = aim_at(shot, target=(40.0, 0.0), speed=30.0)
+aimed.low.angle, aimed.high.angle, aimed.low.time, aimed.ok
+```
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from physjax.checks import concrete, demand, positive_integer, real_quantity
+from physjax.particles import Particles, demand_particles
+from physjax.parts import as_module
+from physjax.physics.contacts.time_of_impact import impact
+from physjax.scene import Scene
+from physjax.stepping.methods import rk4
+from physjax.study.inverse.ricochet import find_bounced
+from physjax.study.inverse.shooting import Launch, Range, chosen, find, first_guess, nearest
+from physjax.trajectory import Trajectory
+from physjax.vectors import dot, norm
+
+STEPS = 200
+"""Steps of a flight unless told otherwise."""
+
+
+class Shot(NamedTuple):
+    """A launch and where it leads, for each target.
+
+    `angle` is the elevation above the horizontal [rad], beyond a right angle for a shot back along x in the plane; in
+    space `azimuth` [rad] is its bearing from x towards z, where z is up from x towards y. Up is what the scene says
+    (`Scene.up`), y by default. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
+    `apex`, the greatest height on the way [m]; `residual`, from the target to where the flight ends [m]. Where `ok` is
+    False this is the nearest miss, or what something in the way makes of the shot, and its derivatives are zero.
+    """
+
+    angle: Float[Array, "*lanes"]
+    azimuth: Float[Array, "*lanes"] | None
+    speed: Float[Array, "*lanes"]
+    time: Float[Array, "*lanes"]
+    velocity: Float[Array, "*lanes dim"]
+    apex: Float[Array, "*lanes"]
+    residual: Float[Array, "*lanes dim"]
+    ok: Bool[Array, "*lanes"]
+
+    @property
+    def miss(self) -> Float[Array, "*lanes"]:
+        """Distance from the target at the end of the flight [m]: rounding where it hits."""
+        return norm(self.residual)
+
+
+class Aimed(eqx.Module):
+    """The shots at each target: `low`, which is there first, and `high`.
+
+    Both are one at the least speed, out of reach, and where there is only one, as in a straight line without forces.
+    """
+
+    low: Shot
+    high: Shot
+    shots: Range
+
+    @property
+    def ok(self) -> Bool[Array, "*lanes"]:
+        """Whether either arc hits."""
+        return self.low.ok | self.high.ok
+
+    @property
+    def target(self) -> Float[Array, "*lanes dim"]:
+        """The targets [m]."""
+        return self.shots.target
+
+    def scene(self, shot: Shot) -> Scene:
+        """The scene with the launch velocity of a shot, to be simulated."""
+        return self.shots.fired(shot.velocity)
+
+    def flight(self, shot: Shot) -> Trajectory:
+        """The whole flight of a shot, every step a frame; it ends at the target."""
+        return self.shots.flight(Launch(shot.velocity, shot.time), save_every=1)
+
+    def plot(self, *, every: int = 1, ax: Any = None) -> Any:
+        """Draw both arcs to one target in so many, and the targets; returns the axes."""
+        from physjax.study.inverse.chart import draw_shots
+
+        return draw_shots(self, every=every, ax=ax)
+
+
+@jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
+def aim_at(
+    scene: Scene,
+    target: ArrayLike,
+    *,
+    speed: ArrayLike | None = None,
+    bounces: int = 0,
+    method: Callable = rk4,
+    steps: int = STEPS,
+) -> Aimed:
+    """The launches from where the scene's lanes are that hit a target `(*lanes, dim)` [m] at a speed [m/s].
+
+    The direction of launch is free; of the state's velocity nothing is used. Without `speed` the least speed that hits
+    is found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
+    angle and flight time are solved for together, to the last digits, so that the error left is the method's own.
+    Contacts are obstacles, unless the target is to be hit after `bounces` impacts on them (`contacts.impact`). Then a
+    fan of directions is tried: `low` is the soonest hit that it leads to, `high` the latest. A target out of reach gives
+    `ok` False and the nearest miss. Works under `jit`, `vmap`, and any derivative with respect to the target, the speed
+    and every number of the scene.
+
+    Raises ValueError or TypeError for a speed <= 0, a target at the start, a launch that is not free.
+
+    Example:
+        >>> start = Scene(Particles(jnp.zeros(2), jnp.zeros(2)), forces=(forces.Gravity(),))
+        >>> aimed = aim_at(start, (5.0, 0.0), speed=9.9)
+        >>> [round(float(np.rad2deg(shot.angle))) for shot in (aimed.low, aimed.high)]
+        [15, 75]
+    """
+    shots = _range(scene, target, method, steps)
+    bounces = _checked_bounces(bounces, speed, shots.scene)
+    if speed is not None:
+        speed = real_quantity("speed [m/s]", speed, above=0).astype(shots.target.dtype)
+        if speed.shape not in ((), shots.target.shape[:-1]):
+            raise ValueError(
+                f"speed [m/s]: got shape {speed.shape}, expected () or {shots.target.shape[:-1]}, one for each target."
+            )
+        speed = jnp.broadcast_to(speed, shots.target.shape[:-1])
+    return Aimed(*_both_arcs(shots, speed, bounces), shots)
+
+
+@eqx.filter_jit
+def _both_arcs(shots: Range, speed: Array | None, bounces: int) -> tuple[Shot, Shot]:
+    if speed is None:
+        shot = _shot(shots, None, None, bounces)
+        return shot, shot
+    both = lax.map(lambda late: _shot(shots, speed, late, bounces), jnp.array([False, True]))
+    return tuple(jax.tree.map(lambda leaf, i=i: leaf[i], both) for i in (0, 1))
+
+
+def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -> Shot:
+    """One arc. Without bounces it is searched in free flight; what is in the way shows when it is flown."""
+    if bounces:
+        launch, legal = _implicit(shots, speed, lambda: find_bounced(shots, speed, late, bounces))
+    else:
+        free = Range(shots.scene.having(contacts=()), shots.target, shots.method, shots.steps)
+        launch, legal = _implicit(free, speed, lambda: _searched(free, speed, late))
+    up = shots.scene.up
+    across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
+    flight = shots.flight(launch, save_every=1, record=_HEIGHTS[up])
+    residual = flight.final_scene.state.position - shots.target
+    ok = legal & (norm(residual) <= shots.rounding(launch))
+    velocity, time = launch = _fixed_unless(ok, launch)
+    level = [velocity[..., axis] for axis in across]
+    forward = level[0] if len(level) == 1 else norm(jnp.stack(level, axis=-1))
+    return Shot(
+        angle=jnp.arctan2(velocity[..., up], forward),
+        azimuth=None if len(level) == 1 else jnp.arctan2(level[1], level[0]),
+        speed=norm(velocity) if speed is None else speed,
+        time=time,
+        velocity=velocity,
+        apex=_fixed_unless(ok, _apex(flight.recorded, launch.time / shots.steps)),
+        residual=_fixed_unless(ok, residual),
+        ok=ok,
+    )
+
+
+def _searched(shots: Range, speed: Array | None, late: Array | None) -> tuple[Launch, Array]:
+    """The launch that hits or, at a given speed, comes nearest; of those any will do."""
+    launch, found = find(shots, speed, late)
+    if speed is None:
+        return launch, found
+    # without a force to bring it back there is no high arc, and the search for it runs away
+    launch = chosen(norm(launch.velocity) > 0.5 * speed, launch, first_guess(shots, speed))
+    too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * shots.rounding(launch)
+    launch, _ = nearest(shots, launch, speed, too_fast | ~found)
+    return launch, jnp.ones_like(found)
+
+
+def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Launch, Array]:
+    """What the search finds, the launch with the derivatives of the implicit function theorem: it is a root of `conditions`."""
+
+    def conditions(packed):
+        launch = Launch(packed[..., :-1], packed[..., -1])
+        if speed is None:
+            miss, turn = shots.following(launch)  # in units of velocity, which has the same root
+            last = dot(launch.velocity, turn)
+        else:
+            miss = shots.miss(launch)
+            last = dot(launch.velocity, launch.velocity) - speed * speed
+        return jnp.concatenate([miss, last[..., None]], axis=-1)
+
+    def packed_search(*_):
+        launch, legal = search()
+        # as a number: before jax 0.11 what comes along with a root cannot be a boolean in derivatives
+        return jnp.concatenate([launch.velocity, launch.time[..., None]], axis=-1), legal.astype(start.dtype)
+
+    start = jnp.zeros((*shots.target.shape[:-1], shots.target.shape[-1] + 1), shots.target.dtype)
+    packed, legal = lax.custom_root(conditions, start, packed_search, _solved_by_lane, has_aux=True)
+    return Launch(packed[..., :-1], packed[..., -1]), legal > 0
+
+
+def _solved_by_lane(linear: Callable, b: Array) -> Array:
+    """The solution of linear(x) = b, a small system for each lane; zero where that is singular."""
+    size = b.shape[-1]
+    rows = jnp.eye(size, dtype=b.dtype)
+    columns = jax.vmap(linear)(
+        jnp.broadcast_to(rows.reshape((size,) + (1,) * (b.ndim - 1) + (size,)), (size, *b.shape))
+    )
+    matrix = jnp.moveaxis(columns, 0, -1)
+    probe = jnp.linalg.solve(lax.stop_gradient(matrix), jnp.ones((*b.shape, 1), b.dtype))
+    sound = jnp.all(jnp.isfinite(probe), axis=(-2, -1))
+    matrix = jnp.where(sound[..., None, None], matrix, rows)
+    return jnp.where(sound[..., None], jnp.linalg.solve(matrix, b[..., None])[..., 0], 0.0)
+
+
+def _height(t: Array, state: Any, *, up: int) -> tuple[Array, Array]:
+    """Height [m] and rate of climb [m/s]."""
+    return state.position[..., up], state.velocity[..., up]
+
+
+_HEIGHTS = [partial(_height, up=axis) for axis in range(3)]
+"""What is recorded of a flight, by the axis that is up; named once, since a new function would compile anew."""
+
+
+def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:
+    """The greatest height [m]: of the frames, and of the cubic through two frames between which the flight turns down."""
+    height, climb = recorded
+    (y0, y1), (v0, v1) = ((a[:-1], a[1:]) for a in (height, climb))
+    turns = (v0 > 0) & (v1 < 0)
+    share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.0)
+    rest = 1 - share
+    top = (
+        rest**2 * (1 + 2 * share) * y0
+        + share**2 * (1 + 2 * rest) * y1
+        + share * rest * dt[None] * (rest * v0 - share * v1)
+    )
+    return jnp.maximum(jnp.max(top, axis=0), height[-1])
+
+
+def _fixed_unless(ok: Array, values: Any) -> Any:
+    """The values, which do not move with anything where a lane is not ok."""
+    return chosen(ok, values, lax.stop_gradient(values))
+
+
+def _checked_bounces(bounces: int, speed: Any, scene: Scene) -> int:
+    bounces = positive_integer("bounces", bounces, at_least=0)
+    if bounces and speed is None:
+        raise ValueError(
+            "aim_at: got bounces without speed=, expected a speed: the least is found in free flight only."
+        )
+    if bounces and not any(contact.response is impact for contact in scene.contacts):
+        raise ValueError(
+            f"bounces: got {bounces} in a scene without contacts that find the moment of impact, expected some, e.g. "
+            "contacts=(contacts.Plane(point=(0, 0), normal=(0, 1), restitution=0.8),)."
+        )
+    return bounces
+
+
+def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Range:
+    """Scene and targets with the same lanes, checked."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"aim_at: got a {type(scene).__name__}, expected a Scene whose position is where it is fired.")
+    if not callable(method):
+        raise TypeError(f"aim_at: got the method {method!r}, expected a method of stepping, e.g. methods.rk4.")
+    steps = positive_integer("steps", steps)
+    demand_particles("aim_at", scene.state, "a launch is a position and a velocity")
+    if scene.pinned is not None:
+        raise ValueError("aim_at: got a scene with pinned lanes, expected a launch velocity that is free. Unpin them.")
+    if scene.couples:
+        raise ValueError(
+            "aim_at: got a scene whose forces couple its lanes, expected shots that fly each on its own. Wrap a plain "
+            "function that looks at its own lane only in forces.independent."
+        )
+    position = scene.state.position
+    if position.shape[-1] not in (2, 3):
+        raise ValueError(f"aim_at: got positions with {position.shape[-1]} components, expected 2 or 3.")
+    target = real_quantity("target [m]", target).astype(position.dtype)
+    if target.ndim == 0 or target.shape[-1] != position.shape[-1]:
+        raise ValueError(
+            f"target [m]: got shape {target.shape}, expected (*lanes, {position.shape[-1]}), as many components as the "
+            "scene has."
+        )
+    lanes, here = target.shape[:-1], scene.state.lanes
+    if lanes and here and lanes != here:
+        raise ValueError(
+            f"target [m]: got targets of shape {lanes} for a scene of {here} lanes, expected one lane for all targets, "
+            "one target for all lanes, or one for each."
+        )
+    shape = (lanes or here) + position.shape[-1:]
+    position, target = jnp.broadcast_to(position, shape), jnp.broadcast_to(target, shape)
+    away = norm(target - position)
+    if concrete(away) is not None:
+        demand("distance from launch to target [m]", away, concrete(away) > 0, "a target away from the launch")
+    at_rest = Particles(position, jnp.zeros_like(position))
+    return Range(scene.having(state=at_rest), target, as_module(method), steps)

@@ -1,0 +1,225 @@
+"""How far the gradient of a run can be trusted: how its sensitivity to the start grows, and whether `jax.grad` has it right."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from physjax.checks import known, real_quantity
+from physjax.scene import Scene
+from physjax.stepping.adaptive import Adaptive
+from physjax.stepping.simulate import simulate
+from physjax.vectors import dot, norm
+
+ROUNDED = 100.0
+"""Times the share to which rounding grows along a path: so far apart may the two modes be."""
+PROBES = 32
+"""Directions looked at: all there are, if they are no more; else random ones, whose mean square is right to a quarter."""
+
+
+class GradientHealth(eqx.Module):
+    """How a small deviation of the start grows, for each lane, or for each scene where lanes are coupled.
+
+    `sensitivity` is its root mean square growth over all directions, |∂x(t)/∂x(0)|/√n: [m per m], or [m per m/s] if the
+    deviation is `of` the velocity. It grows as e^(rate t) where it is `exponential`, else as t^power; the other number is
+    then 0. `limit` is the sensitivity at which the error of the start has become the given fraction of the path, `horizon`
+    [s] the time at which it does: beyond it a gradient says nothing about the true path. A horizon beyond the run goes on
+    with the law found. `mismatch` is how far `jax.grad` is from forward mode, as a share of the derivative, infinite where
+    it is not a number (None where it was not asked for): where that is more than rounding, it is not `ok`, and its horizon
+    is 0.
+
+    Example:
+        >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
+        >>> isinstance(told, gradients.GradientHealth), bool(told.exponential)
+        (True, False)
+    """
+
+    time: Float[Array, "frames *units"]
+    sensitivity: Float[Array, "frames *units"]
+    exponential: Bool[Array, "*units"]
+    rate: Float[Array, "*units"]
+    power: Float[Array, "*units"]
+    limit: Float[Array, "*units"]
+    horizon: Float[Array, "*units"]
+    mismatch: Float[Array, "*units"] | None
+    ok: Bool[Array, "*units"]
+    fraction: Float[Array, ""]
+    of: str = eqx.field(static=True)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the sensitivity over time, its limit and the horizon; returns the axes."""
+        from physjax.study.inverse.gradient_chart import draw_gradient_health
+
+        return draw_gradient_health(self, ax)
+
+
+def health(
+    scene: Scene,
+    method: Callable,
+    *,
+    dt: ArrayLike,
+    steps: int | None = None,
+    duration: float | None = None,
+    save_every: int = 1,
+    of: str = "position",
+    error: ArrayLike | None = None,
+    size: ArrayLike | None = None,
+    fraction: ArrayLike = 0.1,
+    reverse: bool | None = None,
+) -> GradientHealth:
+    """How the sensitivity of a run to its start grows with its length, and up to when its gradient can be trusted.
+
+    Forward mode carries deviations of the start, `of` its "position" or its "velocity", along the frames of
+    `simulate(scene, method, dt=..., steps=..., save_every=...)`: every direction where there are up to 32, as many random
+    ones where there are more. `error` [m] or [m/s] is how wrong the start is: rounding, if not given, ε times the largest
+    position (velocity); for that of the method give what it errs in a characteristic time. The horizon is where error
+    times sensitivity reaches the `fraction` of `size` [m]: of how far the path goes, as the frames tell, if not given.
+    Reverse mode is held against it along one random mixture of the frames; with `reverse=False` it is not, nor, if not
+    given, where it cannot be: under `methods.adaptive` without `tries`, where `jax.grad` raises. Under vmap and jit as
+    well. Raises ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up has an infinite
+    sensitivity from there on.
+
+    Example:
+        >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
+        >>> round(float(told.power), 3), round(float(told.sensitivity[-1]), 3)
+        (1.0, 2.0)
+    """
+    known("kind of deviation", of, ("position", "velocity"))
+    fraction = real_quantity("fraction", fraction, above=0.0)
+    if error is not None:
+        error = real_quantity(f"error [{'m' if of == 'position' else 'm/s'}]", error, above=0.0)
+    if size is not None:
+        size = real_quantity("size [m]", size, above=0.0)
+    ways = _ways(scene)
+
+    def frames(leaf):
+        state = scene.state._replace(**{of: leaf})
+        run = simulate(scene.having(state=state), method, dt=dt, steps=steps, duration=duration, save_every=save_every)
+        return run.position, run
+
+    start = getattr(scene.state, of)
+    push = lambda way: jax.jvp(frames, (start,), (jnp.broadcast_to(way, start.shape),), has_aux=True)  # noqa: E731
+    position, moves, run = jax.vmap(push, out_axes=(None, 0, None))(ways)
+    square = jnp.mean(dot(moves, moves), axis=0)
+    sensitivity = jnp.sqrt(jnp.sum(square, axis=-1) if scene.couples else square)
+    if error is None:
+        typical = _largest(scene, norm(getattr(run, of)))
+        error = float(jnp.finfo(start.dtype).eps) * jnp.where(typical > 0, typical, 1.0)
+    if size is None:
+        way, place = (_largest(scene, norm(x)) for x in (position - position[:1], position))
+        # frames at which it is always back at its start tell of no way, but for rounding
+        size = jnp.where(way > 64 * float(jnp.finfo(start.dtype).eps) * place, way, place)
+    limit = jnp.broadcast_to(fraction.astype(start.dtype) * size / error, scene.status_shape)
+    time = run.time.reshape(run.time.shape + (1,) * (sensitivity.ndim - run.time.ndim))
+    law = _law(time, sensitivity)
+    horizon = _horizon(time, sensitivity, limit, *law)
+    mismatch, ok = None, jnp.ones(horizon.shape, bool)
+    if reverse or (reverse is None and not (isinstance(method, Adaptive) and method.tries is None)):
+        pull = jax.vjp(lambda leaf: frames(leaf)[0], start)[1]
+        mismatch, whole = _mismatch(scene, moves, jnp.broadcast_to(ways, (len(ways), *start.shape)), pull, sensitivity)
+        # where paths from rounded starts go apart, so do the two programs
+        allowed = float(jnp.finfo(start.dtype).eps) ** 0.5 + ROUNDED * jnp.max(sensitivity, axis=0) / limit
+        ok = jnp.isfinite(mismatch) & (mismatch <= allowed)
+        horizon = jnp.where(ok | ~whole, horizon, 0.0)
+    return GradientHealth(run.time, sensitivity, *law, limit, horizon, mismatch, ok, fraction, of)
+
+
+def _mismatch(scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivity: Array) -> tuple[Array, Array]:
+    """How far reverse mode is from forward mode, as a share; and for which units forward mode is finite.
+
+    Both give the derivative of one random mixture of all frames' positions along every way that was looked at.
+    """
+    shape = sensitivity.shape + (1,) * (moves.ndim - 1 - sensitivity.ndim)
+    whole = jnp.all(jnp.isfinite(sensitivity), axis=0)
+    known = whole[None] & (sensitivity > 0)
+    weight = jnp.where(known, 1.0 / jnp.where(known, sensitivity, 1.0), 0.0).reshape(shape)
+    mixture = weight * jax.random.normal(jax.random.key(1), moves.shape[1:], moves.dtype)
+    (gradient,) = pull(mixture)
+    over_nodes = lambda number: jnp.sum(number, axis=-1) if scene.couples else number  # noqa: E731
+    forward = over_nodes(jnp.sum(dot(jnp.broadcast_to(mixture, moves.shape), moves), axis=1))
+    backward = over_nodes(dot(jnp.broadcast_to(gradient, ways.shape), ways))
+    size = jnp.sqrt(jnp.mean(forward**2, axis=0))
+    apart = jnp.sqrt(jnp.mean((backward - forward) ** 2, axis=0)) / jnp.where(size > 0, size, 1.0)
+    return jnp.where(jnp.isfinite(apart), apart, jnp.inf), whole
+
+
+def _ways(scene: Scene) -> Array:
+    """Directions of the start's deviation, `(ways, *lanes, dim)` but for lanes that are independent, of length 1 on average."""
+    shape = scene.state.position.shape[-1 - scene.couples :]
+    count = shape[0] * shape[-1] if scene.couples else shape[-1]
+    if count <= PROBES:
+        return jnp.eye(count, dtype=scene.state.dtype).reshape(count, *_leading(scene), *shape)
+    random = jax.random.normal(jax.random.key(0), (PROBES, *shape), scene.state.dtype) / count**0.5
+    return random.reshape(PROBES, *_leading(scene), *shape)
+
+
+def _leading(scene: Scene) -> tuple[int, ...]:
+    """An axis of length 1 for each axis of lanes, or of scenes, that move alike."""
+    return (1,) * len(scene.status_shape)
+
+
+def _largest(scene: Scene, length: Array) -> Array:
+    """The largest of the lengths over the frames, as long as they are finite, and over the nodes where they are coupled."""
+    largest = jnp.max(jnp.where(jnp.isfinite(length), length, 0.0), axis=0)
+    return jnp.max(largest, axis=-1) if scene.couples else largest
+
+
+def _reached(sensitivity: Array) -> Array:
+    """The logarithm of the largest sensitivity so far; infinite from where the run blew up."""
+    whole = jnp.where(jnp.isfinite(sensitivity), sensitivity, jnp.inf)
+    return jnp.log(jnp.maximum(lax.cummax(whole, axis=0), float(jnp.finfo(sensitivity.dtype).tiny)))
+
+
+def _law(time: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
+    """Whether the growth is exponential, its rate [1/s], and else its power of time, by least squares of its logarithm.
+
+    Over a short span the two are alike: nine tenths of the run decide which it is, the second half how fast it grows.
+    """
+    grown = _reached(sensitivity)
+
+    def fits(first):
+        return [_slope(t, grown[first:]) for t in (time[first:], jnp.log(time[first:]))]
+
+    (_, miss), (_, other) = fits(1 + len(time) // 10)
+    (rate, _), (power, _) = fits(len(time) // 2)
+    exponential = miss < other
+    return exponential, jnp.where(exponential, rate, 0.0), jnp.where(exponential, 0.0, power)
+
+
+def _slope(x: Array, y: Array) -> tuple[Array, Array]:
+    """The slope of the straight line through points along the first axis, and the sum of squares that it leaves."""
+    x, y = x - jnp.mean(x, axis=0, keepdims=True), y - jnp.mean(y, axis=0, keepdims=True)
+    slope = jnp.sum(x * y, axis=0) / jnp.sum(x * x, axis=0)
+    return slope, jnp.sum((y - slope[None] * x) ** 2, axis=0)
+
+
+def _horizon(
+    time: Array, sensitivity: Array, limit: Array, exponential: Array, rate: Array, power: Array
+) -> Float[Array, "*units"]:
+    """When the sensitivity reaches its limit [s]: between two frames on a straight line of its logarithm, else by its law."""
+    grown, goal = _reached(sensitivity), jnp.log(limit)
+    time = jnp.broadcast_to(time, grown.shape)
+    over = grown >= goal[None]
+    i = jnp.clip(jnp.argmax(over, axis=0), 1, len(time) - 1)[None]
+    (t0, t1), (s0, s1) = ([jnp.take_along_axis(leaf, at, axis=0)[0] for at in (i - 1, i)] for leaf in (time, grown))
+    within = t0 + jnp.clip((goal - s0) / jnp.where(s1 > s0, s1 - s0, 1.0), 0.0, 1.0) * (t1 - t0)
+    left = goal - grown[-1]
+    later = jnp.where(
+        exponential,
+        time[-1] + left / jnp.where(rate > 0, rate, 1.0),
+        time[-1] * jnp.exp(left / jnp.where(power > 0, power, 1.0)),
+    )
+    later = jnp.where((rate > 0) | (power > 0), later, jnp.inf)
+    return jnp.where(jnp.any(over, axis=0), within, later)
+
+
+__all__ = ["GradientHealth", "health"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,241 @@
+"""Small motions about a state: which rates a scene has, in which modes, and what a method's step makes of them.
+
+About a state, a deviation d (in coordinates √m δx, which make springs symmetric) moves as d̈ = -K d - C ḋ. A method
+that steps the whole state along its rate sees nothing but the eigenvalues λ of that; one that kicks and drifts sees K
+and C themselves. Contacts are left out: they act at touches, not in between.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from physjax.particles import Particles, demand_particles
+from physjax.parts import Force
+from physjax.scene import Scene
+from physjax.stepping.reference import in_dtype
+
+DENSE = 300
+"""Coordinates of a scene up to which all its modes are found; of larger ones those that move fastest."""
+KRYLOV = 60
+"""Vectors for the fastest modes of stiffness and as many for damping."""
+
+
+RESTING = 1e-6
+"""Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
+ROUNDING = 1e-9
+"""The real part, in parts of the fastest rate, that is none."""
+
+
+class SmallMotion(NamedTuple):
+    """Stiffness K [1/s²] and damping C [1/s] in coordinates √m δx, `(*blocks, n, n)`: a block for each entry of a status.
+
+    `basis` `(*blocks, n, coordinates)` holds in its rows what the n coordinates are; None where they are the lanes'
+    components one after the other.
+    """
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    basis: np.ndarray | None
+
+    def rates(self) -> np.ndarray:
+        """Eigenvalues λ [1/s] of each block, `(*blocks, 2n)`: Re λ is growth, Im λ an angular frequency."""
+        return np.linalg.eigvals(self._rate_matrix())
+
+    def modes(self, block: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues of one block and its modes as columns: positions above, velocities below."""
+        return np.linalg.eig(self._rate_matrix()[block])
+
+    def growing(self, partners: bool = False) -> np.ndarray | None:
+        """What a motion has of those that grow by themselves, as matrices on (d, ḋ), `(*blocks, 2n, 2n)`; None without.
+
+        Growth is e^(λt) however slow, but for drifts. The matrices are projections along all the other modes, so that
+        without that part a motion goes on as if none of it grew. With `partners` they take what decays as fast as
+        another grows as well: the same displacements, without damping.
+        """
+        # in units in which both halves of the fastest motion are as large
+        fastest = self.pace()
+        pace = np.where(fastest > 0, fastest, 1.0)
+        unit = np.concatenate([np.broadcast_to(a, self.stiffness.shape[:-1]) for a in (pace[..., None], 1.0)], axis=-1)
+        scaled = self._rate_matrix() * unit[..., :, None] / unit[..., None, :]
+        found = np.zeros_like(scaled)
+        for block in np.ndindex(scaled.shape[:-2]):
+            λ, right = np.linalg.eig(scaled[block])
+            size = np.abs(λ.real) if partners else λ.real
+            grows = (size > ROUNDING * pace[block]) & (np.abs(λ) > RESTING * pace[block])
+            if not grows.any():
+                continue
+            same, left = np.linalg.eig(scaled[block].T)
+            # of a matrix and its transpose the same eigenvalues, the nearest to each
+            matched = []
+            for number in λ[grows]:
+                apart = np.abs(same - number)
+                apart[matched] = np.inf
+                matched.append(int(np.argmin(apart)))
+            right, left = right[:, grows], left[:, matched]
+            found[block] = (right @ np.linalg.solve(left.T @ right, left.T)).real
+        return found / unit[..., :, None] * unit[..., None, :] if found.any() else None
+
+    def pace(self) -> np.ndarray:
+        """The fastest rate of each block [1/s]."""
+        return np.abs(self.rates()).max(axis=-1)
+
+    def displacement(self, block: tuple[int, ...], mode: np.ndarray) -> np.ndarray:
+        """The positions of a mode of a block, `(coordinates,)` complex, of length 1."""
+        n = self.stiffness.shape[-1]
+        # a mode that decays at once is seen in both halves, a drift in the velocities alone
+        moved = mode[:n] if np.linalg.norm(mode[:n]) > 0 else mode[n:]
+        moved = moved if self.basis is None else moved @ self.basis[block]
+        return moved / np.linalg.norm(moved)
+
+    @property
+    def undamped(self) -> bool:
+        """Whether forces depend on positions alone: every method then steps each mode by itself."""
+        return not np.any(self.damping)
+
+    def _rate_matrix(self) -> np.ndarray:
+        zero = np.zeros_like(self.stiffness)
+        one = zero + np.eye(zero.shape[-1])
+        return np.block([[zero, one], [-self.stiffness, -self.damping]])
+
+
+def about(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
+    """A scene in float64 and the state about which its small motions are asked for: its own, if none is given."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"stability: got a {type(scene).__name__}, expected a Scene.")
+    scene = in_dtype(scene, jnp.float64)
+    state = scene.state if at is None else Particles(*(jnp.asarray(a, jnp.float64) for a in at))
+    if state.position.shape != scene.state.position.shape:
+        raise ValueError(
+            f"at: got positions of shape {state.position.shape}, expected the scene's {scene.state.position.shape}."
+        )
+    return scene, state
+
+
+def small_motion(scene: Scene, state: Particles) -> SmallMotion:
+    """K and C of a scene about a state; held lanes do not move. Of large coupled scenes, their fastest modes."""
+    demand_particles("small motions", state, "what turns is not linearised")
+    inside = scene.state.lanes[-1:] if scene.couples else ()
+    size = int(np.prod(inside)) * state.position.shape[-1]
+    if size <= DENSE:
+        stiffness, damping = _dense(scene, state, size)
+        return SmallMotion(np.asarray(stiffness), np.asarray(damping), None)
+
+    def push(vector, which):
+        pair = (vector, np.zeros_like(vector))
+        return np.asarray(_push(scene, state, *map(jnp.asarray, pair[::-1] if which else pair)))
+
+    start = np.random.default_rng(0).normal(size=(*scene.status_shape, size))
+    basis: list[np.ndarray] = []
+    for which in (0, 1):
+        vector, fresh = start, True
+        for _ in range(KRYLOV):
+            vector, fresh = _orthonormal(vector, basis)
+            if not fresh:
+                break
+            basis.append(vector)
+            vector = push(vector, which)
+    rows = np.stack(basis, axis=-2)
+    project = lambda which: rows @ np.stack([push(vector, which) for vector in basis], axis=-1)  # noqa: E731
+    return SmallMotion(project(0), project(1), rows)
+
+
+def _orthonormal(vector: np.ndarray, basis: list[np.ndarray]) -> tuple[np.ndarray, bool]:
+    """The part of a vector that the basis lacks, of length 1, and whether there is any."""
+    before = np.linalg.norm(vector, axis=-1, keepdims=True)
+    for _ in range(2):  # the first pass leaves rounding errors of the size of what it takes away
+        for other in basis:
+            vector = vector - np.sum(vector * other, axis=-1, keepdims=True) * other
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return vector / np.where(length > 0, length, 1.0), bool(np.all(length > 1e-10 * before))
+
+
+@eqx.filter_jit
+def _push(scene: Scene, state: Particles, moved: Array, speed: Array) -> Array:
+    """K d + C ḋ for coordinates d and ḋ, `(*blocks, n)`."""
+    weight = weight_of(scene, state)
+    tangent = Particles(*(_free(scene, a.reshape(state.position.shape)) / weight for a in (moved, speed)))
+    change = jax.jvp(lambda s: scene.acceleration(jnp.zeros((), s.dtype), s), (state,), (tangent,))[1]
+    return -(weight * _free(scene, change)).reshape(moved.shape)
+
+
+@eqx.filter_jit
+def _dense(scene: Scene, state: Particles, size: int) -> tuple[Array, Array]:
+    """K and C column by column."""
+    blocks = scene.status_shape
+    unit = jnp.eye(2 * size, dtype=state.dtype).reshape((2 * size, *(1,) * len(blocks), 2 * size))
+    moved, speed = jnp.split(jnp.broadcast_to(unit, (2 * size, *blocks, 2 * size)), 2, axis=-1)
+    columns = jax.vmap(lambda moved, speed: _push(scene, state, moved, speed))(moved, speed)
+    return tuple(jnp.moveaxis(a, 0, -1) for a in jnp.split(columns, 2))
+
+
+def weight_of(scene: Scene, state: Particles) -> Array:
+    """√m for each component of each lane: what makes a displacement a coordinate."""
+    return jnp.broadcast_to(jnp.sqrt(scene.mass)[..., None], state.position.shape)
+
+
+def _free(scene: Scene, a: Array) -> Array:
+    return a if scene.held is None else a * (1 - jnp.asarray(scene.held)[..., None].astype(a.dtype))
+
+
+class _Linear(Force):
+    """F = -(K x + C v)."""
+
+    couples: ClassVar[bool] = True
+    stiffness: Array
+    damping: Array
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Array) -> Array:
+        return -(self.stiffness @ state.position + self.damping @ state.velocity)
+
+
+@eqx.filter_jit
+def step_matrices(method: Callable, stiffness: Array, damping: Array, dt: Array) -> Array:
+    """The matrix of one step of a method on each block's small motion, `(blocks, 2n, 2n)`; `dt` is `(blocks,)`."""
+
+    def matrix(stiffness, damping, dt):
+        n = stiffness.shape[0]
+        still = jnp.zeros((n, 1), stiffness.dtype)
+        scene = Scene(Particles(still, still), forces=(_Linear(stiffness, damping),))
+
+        def column(y):
+            after = method(scene, jnp.zeros((), y.dtype), Particles(y[:n, None], y[n:, None]), dt)
+            return jnp.concatenate(after)[:, 0]
+
+        return jax.vmap(column, out_axes=1)(jnp.eye(2 * n, dtype=stiffness.dtype))
+
+    return jax.vmap(matrix)(stiffness, damping, dt)
+
+
+@eqx.filter_jit
+def radius(method: Callable, z: Any) -> Array:
+    """Spectral radius of one step of a method at z = λ dt, on x″ = −|λ|²x + 2Re(λ)x′, for complex numbers of any shape."""
+    flat = jnp.ravel(z)
+    stiffness, damping = (jnp.abs(flat) ** 2)[:, None, None], (-2 * flat.real)[:, None, None]
+    m = step_matrices(method, stiffness, damping, jnp.ones_like(flat.real))
+    half, product = (m[:, 0, 0] + m[:, 1, 1]) / 2, m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+    apart = half * half - product
+    real = jnp.abs(half) + jnp.sqrt(jnp.maximum(apart, 0.0))
+    return jnp.where(apart > 0, real, jnp.sqrt(jnp.maximum(product, 0.0))).reshape(z.shape)
+
+
+def follows_rates(method: Callable) -> bool:
+    """Whether a step is a function of the rate's matrix alone: it then commutes with it, whatever K and C are."""
+    stiffness, damping = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[0.3, -0.4], [-0.4, 1.5]])
+    rate = SmallMotion(stiffness, damping, None)._rate_matrix()
+    step = np.asarray(step_matrices(method, *map(jnp.asarray, (stiffness[None], damping[None])), jnp.full(1, 0.3)))[0]
+    return bool(np.abs(step @ rate - rate @ step).max() < 1e-12)
+
+
+def rate_text(rate: complex) -> str:
+    """A rate in few digits, as real, imaginary or the pair that it belongs to."""
+    if abs(rate.imag) < 1e-9 * abs(rate):
+        return f"{rate.real:.4g}"
+    return (
+        f"±{abs(rate.imag):.4g}i" if abs(rate.real) < 1e-9 * abs(rate) else f"{rate.real:.4g} ± {abs(rate.imag):.4g}i"
+    )

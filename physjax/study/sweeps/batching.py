@@ -1,0 +1,296 @@
+"""A measure as one compiled program over many lanes: traced once, judged lane by lane, run in blocks.
+
+A block is a `vmap` over so many lanes as fit a cache; a batch is some blocks one after the other, on every device its share.
+"""
+
+import functools
+import hashlib
+import inspect
+import linecache
+import math
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from physjax.stepping.blocks import BLOCK
+from physjax.stepping.simulate import WIDE
+from physjax.study.sweeps.design import leaf_name
+from physjax.study.sweeps.fingerprint import host_calls, inside, lasting_digest
+from physjax.trajectory import Trajectory
+
+CARRIED = 64 * BLOCK
+"""Bytes of a block that a turn of a loop may hand on, to stay in a core's cache with the stages of a step."""
+LARGEST = 16 * BLOCK
+"""Lanes in a batch at most: more gain nothing, and a batch is what a kill loses and what progress is counted in."""
+VERDICTS = {
+    "Run": "blew up: the run's state is not finite at its end",
+    "Solution": "not solved: the search ended without a root",
+    "Minimum": "not solved: the search ended without a minimum",
+    "Crossing": "no crossing found",
+    "Aimed": "out of reach",
+    "Shot": "out of reach",
+}
+"""What it means that a result is not `ok`, by its type; others say only that."""
+
+
+class Run(NamedTuple):
+    """What is kept of a `Trajectory` that a measure returns: frames or what was recorded, and whether it held."""
+
+    time: Any
+    state: Any
+    recorded: Any
+    ok: Any
+
+
+class Traced(NamedTuple):
+    """A measure as a program for one lane: `jaxpr` from the leaves of a point to those of its values and a status.
+
+    `values` is the tree of the values, with shapes and dtypes in its leaves; status k means `reasons[k]`, 0 is good.
+    `carried` and `peak` are the bytes that its loops carry, and that are alive at a time, at most. `digest` is a hash of
+    the program with the constants it closes over, `calls` what it calls outside of itself, which no hash of it tells.
+    """
+
+    jaxpr: ClosedJaxpr
+    values: Any
+    reasons: tuple[str, ...]
+    digest: str
+    calls: tuple[tuple[str, Any], ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        # functions that are called back must be the very same: equal ones may close over arrays that change later
+        return isinstance(other, Traced) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple:
+        return (self.digest, *((kind, id(called)) for kind, called in self.calls))
+
+    @property
+    def lasting_digest(self) -> str:
+        """A hash by which another process knows the same measure; ValueError where it calls what has none."""
+        return lasting_digest(self.digest, self.calls)
+
+    @property
+    def carried(self) -> int:
+        """Bytes that a turn of a loop hands on, at most; without loops all that is alive."""
+        return _most_carried(self.jaxpr.jaxpr) or self.peak
+
+    @property
+    def peak(self) -> int:
+        """Bytes alive at a time, at most, if nothing is fused."""
+        return max(1, _peak(self.jaxpr.jaxpr))
+
+    @property
+    def passed(self) -> int:
+        """Bytes that go in and come out."""
+        return _bytes(self.jaxpr.jaxpr.invars) + _bytes(self.jaxpr.jaxpr.outvars)
+
+
+class Layout(NamedTuple):
+    """How lanes are cut: `count` blocks of `size` lanes make a batch, of which `batch` lanes are used."""
+
+    batch: int
+    size: int
+    count: int
+
+
+def traced(measure: Callable, point: Any) -> Traced:
+    """Trace a measure at a point, given as shapes and dtypes by name."""
+    seen = []
+
+    def lane(point):
+        values = jax.tree.map(jnp.asarray, _shown(measure(**point)))
+        reasons = _judged(values)
+        status = jnp.zeros((), jnp.int16)
+        for code in range(len(reasons), 0, -1):
+            status = jnp.where(reasons[code - 1][1], status, jnp.int16(code))
+        seen.append((jax.eval_shape(lambda: values), ("ok", *(reason for reason, _ in reasons))))
+        return values, status
+
+    leaves, tree = jax.tree.flatten(point)
+    try:
+        jaxpr = jax.make_jaxpr(lambda *flat: jax.tree.leaves(lane(jax.tree.unflatten(tree, flat))))(*leaves)
+    except TypeError as error:
+        raise TypeError(_untraceable(measure, point, error)) from error
+    values, reasons = seen[-1]
+    if not jax.tree.leaves(values):
+        raise ValueError(f"measure: {_name(measure)} returned {values!r}, expected at least one number.")
+    digest, calls = _digest(jaxpr, leaves)
+    return Traced(jaxpr, values, reasons, digest, calls)
+
+
+def layout(
+    program: Traced,
+    lanes: int,
+    memory: int,
+    devices: Sequence[Any],
+    batch: int | None = None,
+    begun: tuple[int, int] | None = None,
+) -> Layout:
+    """Blocks for so many lanes whose programs and batches fit into so many bytes; of a sweep that has begun, its own.
+
+    `begun` are the lanes in a batch and in a block of such a sweep.
+    """
+    needed = program.peak + program.passed
+    if needed > memory:
+        raise ValueError(
+            f"memory: got {memory:,} bytes, expected at least {needed:,}, which one lane of the measure may take. Give more, "
+            "or keep fewer frames (save_every, record)."
+        )
+    if begun is not None and batch in (None, begun[0]):
+        batch, size = begun
+    else:
+        share = math.ceil(min(lanes, batch or lanes) / len(devices))
+        # a CPU is fastest in its cache, anything else with all that it can hold
+        best = min(CARRIED // program.carried, BLOCK) if devices[0].platform == "cpu" else LARGEST
+        fitting = min(best, memory // (2 * len(devices) * program.peak))
+        size = min(share, 1 << max(0, fitting.bit_length() - 1))
+        left = memory - len(devices) * size * program.peak
+        most = max(size, min(LARGEST, left // (2 * program.passed)) // size * size)
+        # batches of equal length in whole blocks
+        batch = batch or math.ceil(lanes / math.ceil(lanes / most) / size) * size
+        size = math.ceil(batch / math.ceil(batch / size))
+    return Layout(batch, size, math.ceil(math.ceil(batch / size) / len(devices)) * len(devices))
+
+
+@functools.lru_cache(maxsize=16)
+def compiled(program: Traced, cut: Layout, devices: tuple) -> Callable:
+    """The batch as one executable: leaves `(count, size, ...)` of points to those of values, and status."""
+    one = jax.vmap(jaxpr_as_fun(program.jaxpr))
+
+    def batch(*flat):
+        return lax.map(lambda block: one(*block), flat)
+
+    mesh = Mesh(np.asarray(devices), ("lanes",))
+    spec = PartitionSpec("lanes")
+    if len(devices) > 1:
+        batch = jax.shard_map(batch, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    shapes = [
+        jax.ShapeDtypeStruct((cut.count, cut.size, *v.aval.shape), v.aval.dtype) for v in program.jaxpr.jaxpr.invars
+    ]
+    placed = NamedSharding(mesh, spec)
+    options = WIDE if devices[0].platform == "cpu" else None
+    whole = jax.jit(batch, in_shardings=placed, out_shardings=placed, compiler_options=options)
+    executable = whole.lower(*shapes).compile()
+    return lambda *flat: executable(*jax.device_put(flat, placed))
+
+
+def _shown(outcome: Any) -> Any:
+    """What is kept of a measure's outcome: runs leave their scene behind."""
+    is_run = lambda node: isinstance(node, Trajectory)  # noqa: E731
+    shorten = lambda node: Run(node.time, node.state, node.recorded, node.ok) if is_run(node) else node  # noqa: E731
+    return jax.tree.map(shorten, outcome, is_leaf=is_run)
+
+
+def _judged(values: Any) -> list[tuple[str, Any]]:
+    """Reasons for which a lane may be bad, each with whether it is good: its own verdicts first, then its numbers."""
+    judged = [
+        (f"{VERDICTS.get(type(node).__name__, 'not ok')}{_at(path)}", jnp.all(_ok(node)))
+        for path, node in _nodes(values)
+        if _ok(node) is not None
+    ]
+    return judged + [
+        (f"not finite{_at(path)}", jnp.all(jnp.isfinite(leaf)))
+        for path, leaf in jax.tree_util.tree_leaves_with_path(values)
+        if jnp.issubdtype(leaf.dtype, jnp.inexact)
+    ]
+
+
+def _nodes(tree: Any, path: tuple = ()) -> list[tuple[tuple, Any]]:
+    """Every node of a tree that is not a leaf, with its path, the outer ones first."""
+    below = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: node is not tree)
+    if len(below) == 1 and below[0][1] is tree:
+        return []
+    return [(path, tree)] + [found for keys, child in below for found in _nodes(child, (*path, *keys))]
+
+
+def _ok(node: Any) -> Any:
+    return node.get("ok") if isinstance(node, dict) else getattr(node, "ok", None)
+
+
+def _at(path: tuple) -> str:
+    return f" (at {leaf_name(path)})" if path else ""
+
+
+def _digest(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
+    """A hash of what is computed, with the constants that it closes over, whatever the code is called and looks like.
+
+    And what the program calls outside of itself, of which its text has no more than a number.
+    """
+    text = jax.jit(jaxpr_as_fun(jaxpr)).lower(*leaves).as_text()
+    found = hashlib.sha256(text.encode())
+    for constant in jaxpr.consts:
+        if jnp.issubdtype(getattr(constant, "dtype", float), jax.dtypes.prng_key):
+            constant = jax.random.key_data(constant)
+        found.update(np.asarray(constant).tobytes())
+    calls = tuple(host_calls(jaxpr.jaxpr))
+    if not calls and "python" in text and "callback" in text:
+        calls = (("unknown", None),)
+    return found.hexdigest(), calls
+
+
+def _name(measure: Callable) -> str:
+    return getattr(_plain(measure), "__qualname__", type(measure).__name__)
+
+
+def _plain(measure: Any) -> Any:
+    """The user's own function inside partials and wrappers."""
+    while isinstance(measure, functools.partial):
+        measure = measure.func
+    return inspect.unwrap(measure) if callable(measure) else measure
+
+
+def _untraceable(measure: Callable, point: Any, error: TypeError) -> str:
+    """Which line of the measure cannot be traced, and why."""
+    plain = _plain(measure)
+    code = getattr(plain if hasattr(plain, "__code__") else type(plain).__call__, "__code__", None)
+    frames = traceback.extract_tb(error.__traceback__)
+    here = [frame for frame in frames if code is not None and frame.filename == code.co_filename]
+    reason = str(error).splitlines()[0]
+    if not here:
+        return f"measure: {_name(measure)} cannot be called with {', '.join(point)}, one number each: {reason}"
+    line = here[-1]
+    source = linecache.getline(line.filename, line.lineno).strip()
+    return (
+        f"measure: {_name(measure)} cannot be traced at {line.filename}, line {line.lineno}: `{source}`. {reason} A sweep is one "
+        "compiled program for all lanes, in which a swept number has no single value: expected jnp functions, jnp.where "
+        "and lax.cond instead of Python's branches and float(), and shapes and counts that no axis changes."
+    )
+
+
+def _bytes(variables: Sequence[Any]) -> int:
+    sized = [v.aval for v in variables if hasattr(v.aval, "shape")]
+    return sum(math.prod(aval.shape) * getattr(aval.dtype, "itemsize", 8) for aval in sized)
+
+
+def _most_carried(jaxpr: Jaxpr) -> int:
+    """Bytes that a turn of any loop hands on, at most: what it carries, and what it stacks."""
+    most = 0
+    for equation in jaxpr.eqns:
+        bodies = inside(equation)
+        loops = bodies if equation.primitive.name in ("scan", "while") else []
+        most = max([most, *(_bytes(body.outvars) for body in loops), *map(_most_carried, bodies)])
+    return most
+
+
+def _peak(jaxpr: Jaxpr) -> int:
+    """Bytes alive at a time, at most: of every operation its results, what is still to be used, and what it needs inside."""
+    last = {v: i for i, equation in enumerate(jaxpr.eqns) for v in equation.invars if not isinstance(v, Literal)}
+    kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
+    alive, most = _bytes(jaxpr.invars), 0
+    for i, equation in enumerate(jaxpr.eqns):
+        alive += _bytes(equation.outvars)
+        most = max(most, alive + max(map(_peak, inside(equation)), default=0))
+        used = {v for v in equation.invars if not isinstance(v, Literal)}
+        alive -= _bytes([v for v in used if last[v] == i and v not in kept])
+        alive -= _bytes([v for v in equation.outvars if v not in last and v not in kept])
+    return max(most, alive)

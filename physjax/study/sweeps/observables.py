@@ -1,0 +1,102 @@
+"""What a run comes to, as one number with a name, and sweeps of the numbers that a scene is built from."""
+
+import inspect
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from physjax.checks import known, positive_integer
+from physjax.stepping.simulate import simulate
+from physjax.study.energy.quantities import total
+from physjax.study.problem import Problem
+from physjax.study.sweeps.batching import Run
+from physjax.study.sweeps.design import checked_lanes
+from physjax.study.sweeps.result import Sweep
+from physjax.study.sweeps.sweep import sweep
+from physjax.trajectory import Trajectory
+from physjax.vectors import norm
+
+FRAMES = 32
+"""Moments of a run that an outcome sees."""
+
+
+def height(flight: Trajectory) -> Float[Array, ""]:
+    """Greatest height of anything on the way [m]."""
+    return jnp.max(flight.position[..., flight.scene.up])
+
+
+def distance(flight: Trajectory) -> Float[Array, ""]:
+    """Distance from start to end of what went furthest [m]."""
+    return jnp.max(norm(flight.position[-1] - flight.position[0]))
+
+
+def speed(flight: Trajectory) -> Float[Array, ""]:
+    """Speed at the end of what is fastest [m/s]."""
+    return jnp.max(norm(flight.velocity[-1]))
+
+
+def energy(flight: Trajectory) -> Float[Array, ""]:
+    """Kinetic and potential energy of all at the end [J]."""
+    end = flight.final_scene
+    return jnp.sum(total(end, flight.time[-1], end.state))
+
+
+OUTCOMES = {outcome.__name__: outcome for outcome in (height, distance, speed, energy)}
+"""Outcomes by name: functions of a `Trajectory`; their docstrings say what they are, and in which unit."""
+
+
+class _Lane(NamedTuple):
+    """What differs between the lanes of a sweep over a scene's numbers."""
+
+    built: Any
+    duration: float
+
+
+def swept_scene(
+    build: Callable[..., Problem],
+    axes: Mapping[str, Any],
+    outcome: str,
+    *,
+    method: Callable,
+    steps: int,
+    **options: Any,
+) -> Sweep:
+    """An outcome of a scene of the gallery at every point of a grid of the numbers that it is built from.
+
+    Each lane runs for its own scene's duration, in `steps` equal steps (at least, a multiple of 32). Every scene is built
+    before the first one runs. `options` go to `sweep`. Raises ValueError for names that are not known, and where a
+    number changes the shape of the scene.
+    """
+    outcome = known("outcome", outcome, OUTCOMES)
+    grid = checked_lanes(axes, "grid")
+    takes = inspect.signature(build).parameters
+    for name in axes:
+        known(f"number of {build.__name__}", name, takes)
+    values = [axis.coordinate if takes[axis.name].annotation is not int else _whole(axis) for axis in grid.axes]
+    built = [build(**dict(zip(axes, point, strict=True))) for point in itertools.product(*(v.tolist() for v in values))]
+    flat = {axis.name: axis.at(i) for axis, i in zip(grid.axes, grid.indices(np.arange(grid.count)), strict=True)}
+    each = -(-positive_integer("steps", steps) // FRAMES)
+
+    def measure(scene, **_):
+        dt = scene.duration / (each * FRAMES)
+        flight = simulate(scene.built, method, dt=dt, steps=each * FRAMES, save_every=each)
+        return {outcome: OUTCOMES[outcome](flight), "run": Run(None, None, None, flight.ok)}
+
+    problems = [_Lane(problem.scene, problem.duration) for problem in built]
+    found = sweep(measure, flat | {"scene": problems}, design="zip", **options)
+    return replace(found, lanes=grid)
+
+
+def _whole(axis: Any) -> np.ndarray:
+    """The values of an axis that counts something."""
+    counts = np.round(axis.coordinate).astype(int)
+    if np.any(counts != axis.coordinate):
+        raise ValueError(
+            f"axis {axis.name}: got {axis.coordinate.tolist()}, expected whole numbers: it counts something."
+        )
+    return counts
