@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import harness
 import jax
 import numpy as np
-from harness import Bar, tell
+from harness import Bar, print_progress
 
 from physjax import energy, methods, simulate
-from physjax.files import replacing
+from physjax.files import write_atomically
 from physjax.scenes import SCENES
 
-GOAL = 1e-6
+ERROR_GOAL = 1e-6
 COLOURS = {"rk4": "#009E73", "verlet": "#0072B2", "leapfrog": "#CC79A7", "euler": "#D55E00"}
 SYMPLECTIC = ("leapfrog", "verlet")
-FRAMES = 20
+FRAMES_PER_ORBIT = 20
 """Moments of an orbit at which the energy is looked at."""
-TRIES = 3
+STEPS_PER_TRY = 3
 """A try is a step whole and in halves."""
 
 
@@ -43,54 +43,54 @@ FULL = Settings(tuple(10.0**-i for i in range(3, 12)), tuple(500 * 2**i for i in
 QUICK = Settings((1e-4, 1e-6, 1e-10), (500, 8000, 32_000), 10, 800)
 
 
-def closest(problem: Any, method: Callable, steps: int) -> float:
+def measure_error(problem: Any, method: Callable, steps: int) -> float:
     """Error of position after the whole duration [m]."""
     run = simulate(problem.scene, method, dt=problem.duration / steps, steps=steps, save_every=steps)
     exact = problem.exact(np.array([problem.duration])).position[0]
     return float(np.abs(np.asarray(run.position[-1]) - exact).max())
 
 
-def adapted(problem: Any, method: Callable, tolerance: float, frames: int = 4) -> dict:
+def measure_adaptive(problem: Any, method: Callable, tolerance: float, frames: int = 4) -> dict:
     """Error, evaluations and rejections of a run under error control."""
     chooser = methods.adaptive(method, tolerance, tolerance)
-    told = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
-    tries, rejected = int((told.accepted + told.rejected).sum()), int(told.rejected.sum())
+    counted = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
+    tries, rejected = int((counted.accepted + counted.rejected).sum()), int(counted.rejected.sum())
     exact = problem.exact(np.array([problem.duration])).position[0]
-    evaluations = TRIES * method.promises.evaluations * tries + 2 * frames
-    error = float(np.abs(np.asarray(told.state.position[-1]) - exact).max())
+    evaluations = STEPS_PER_TRY * method.promises.evaluations * tries + 2 * frames
+    error = float(np.abs(np.asarray(counted.state.position[-1]) - exact).max())
     row = {"method": f"adaptive {method.__name__}", "tolerance": tolerance, "error": error, "evaluations": evaluations}
     return row | {"tries": tries, "rejected": rejected}
 
 
-def work_and_error(size: Settings) -> list[dict]:
+def measure_work_and_error(size: Settings) -> list[dict]:
     """Error against evaluations on the orbit of eccentricity 0.9."""
     problem, rows = SCENES["kepler"](), []
     for steps in size.counts:
         evaluations = steps * methods.rk4.promises.evaluations
-        rows.append({"method": "rk4", "error": closest(problem, methods.rk4, steps), "evaluations": evaluations})
+        rows.append({"method": "rk4", "error": measure_error(problem, methods.rk4, steps), "evaluations": evaluations})
     for method in (methods.rk4, methods.verlet):
         # an order of two needs a great many steps for the finest
-        rows += [adapted(problem, method, t) for t in size.tolerances if method is methods.rk4 or t >= 1e-8]
+        rows += [measure_adaptive(problem, method, t) for t in size.tolerances if method is methods.rk4 or t >= 1e-8]
     return rows
 
 
-def evaluations_at(rows: list[dict], name: str) -> float:
+def interpolate_evaluations(rows: list[dict], name: str) -> float:
     """Evaluations at which a method's error falls to the goal, on a straight line between logarithms."""
     points = sorted((r["evaluations"], r["error"]) for r in rows if r["method"] == name)
     for (n0, e0), (n1, e1) in pairwise(points):
-        if e1 <= GOAL < e0:
-            return float(n0 * (n1 / n0) ** (np.log(e0 / GOAL) / np.log(e0 / e1)))
+        if e1 <= ERROR_GOAL < e0:
+            return float(n0 * (n1 / n0) ** (np.log(e0 / ERROR_GOAL) / np.log(e0 / e1)))
     return float("nan")
 
 
-def energies(size: Settings) -> dict[str, dict[str, np.ndarray]]:
+def compare_energies(size: Settings) -> dict[str, dict[str, np.ndarray]]:
     """Relative change of the energy over many orbits, equal steps beside steps that follow an error."""
     problem = SCENES["kepler"](eccentricity=0.6, orbits=size.orbits)
     start = float(energy.total(problem.scene, 0.0, problem.scene.state))
     found = {}
     for method in (methods.leapfrog, methods.verlet, methods.rk4):
-        chooser, spent = matched(problem, method, size)
-        frames = size.orbits * FRAMES
+        chooser, spent = match_cost(problem, method, size)
+        frames = size.orbits * FRAMES_PER_ORBIT
         each = max(1, round(spent / method.promises.evaluations / frames))
         steps = each * frames
         change = lambda t, state: energy.total(problem.scene, t, state) / start - 1  # noqa: E731
@@ -99,20 +99,20 @@ def energies(size: Settings) -> dict[str, dict[str, np.ndarray]]:
         )
         follows = simulate(problem.scene, chooser, dt=problem.duration / frames, steps=frames, record=change)
         found[method.__name__] = {"equal": np.asarray(equal.recorded)[1:], "adaptive": np.asarray(follows.recorded)[1:]}
-        tell(f"  {method.__name__}: {steps} equal steps beside {spent} evaluations under error control")
+        print_progress(f"  {method.__name__}: {steps} equal steps beside {spent} evaluations under error control")
     return found
 
 
-def matched(problem: Any, method: Callable, size: Settings) -> tuple[Any, int]:
+def match_cost(problem: Any, method: Callable, size: Settings) -> tuple[Any, int]:
     """The method under error control with the tolerance that makes it cost nearly so many evaluations."""
     low, high = -12.0, -2.0
-    goal, frames = size.orbits * size.per_orbit, size.orbits * FRAMES
+    goal, frames = size.orbits * size.per_orbit, size.orbits * FRAMES_PER_ORBIT
     for _ in range(10):
         middle = (low + high) / 2
         chooser = methods.adaptive(method, 10.0**middle, 10.0**middle)
-        told = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
-        spent = TRIES * method.promises.evaluations * int((told.accepted + told.rejected).sum())
-        low, high = (middle, high) if spent > goal or not told.ok.all() else (low, middle)
+        counted = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
+        spent = STEPS_PER_TRY * method.promises.evaluations * int((counted.accepted + counted.rejected).sum())
+        low, high = (middle, high) if spent > goal or not counted.ok.all() else (low, middle)
     return chooser, spent
 
 
@@ -138,36 +138,36 @@ def draw(path: Any, rows: list[dict], found: dict, size: Settings, foot: str) ->
     left.grid(alpha=0.3)
     for name, runs in found.items():
         for kind, line in (("equal", "--"), ("adaptive", "-")):
-            worst = np.abs(runs[kind]).reshape(size.orbits, FRAMES).max(axis=-1)
+            worst = np.abs(runs[kind]).reshape(size.orbits, FRAMES_PER_ORBIT).max(axis=-1)
             label = f"{name}, {'equal steps' if kind == 'equal' else 'adaptive'}"
             right.loglog(np.arange(1, size.orbits + 1), worst, line, color=COLOURS[name], label=label)
     right.set(xlabel="orbit", ylabel="largest relative change of energy", title="eccentricity 0.6, at equal cost")
     right.legend(frameon=False, fontsize=8)
     right.grid(alpha=0.3)
     figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
-    with replacing(path, "wb") as file:
+    with write_atomically(path, "wb") as file:
         figure.savefig(file, format="png", dpi=150)
 
 
 def main() -> None:
     """Run all studies, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
     with jax.enable_x64(True):
-        tell("error against evaluations")
-        rows = work_and_error(size)
-        tell("energy over many orbits")
-        found = energies(size)
+        print_progress("error against evaluations")
+        rows = measure_work_and_error(size)
+        print_progress("energy over many orbits")
+        found = compare_energies(size)
     drifts = {name: {kind: drift(change) for kind, change in runs.items()} for name, runs in found.items()}
-    share = evaluations_at(rows, "adaptive rk4") / evaluations_at(rows, "rk4")
-    lost = min(drifts[name]["adaptive"] / drifts[name]["equal"] for name in SYMPLECTIC)
+    share = interpolate_evaluations(rows, "adaptive rk4") / interpolate_evaluations(rows, "rk4")
+    drift_ratio = min(drifts[name]["adaptive"] / drifts[name]["equal"] for name in SYMPLECTIC)
     rejected = max(row["rejected"] / row["tries"] for row in rows if "tries" in row)
     bars = [
         Bar("evaluations at an error of 1e-6, adaptive / equal steps of rk4", share, "<=", 1 / 3),
         Bar("largest share of rejected tries", rejected, "<=", 0.05),
-        Bar("drift of energy of symplectic methods, adaptive / equal steps [times]", lost, ">=", 10.0),
+        Bar("drift of energy of symplectic methods, adaptive / equal steps [times]", drift_ratio, ">=", 10.0),
     ]
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     cells = [[r["method"], r.get("tolerance", "-"), r["error"], r["evaluations"], r.get("rejected", "-")] for r in rows]
     harness.print_table(
         "eccentricity 0.9, two orbits", ["", "tolerance", "error [m]", "evaluations", "rejected"], cells
@@ -181,7 +181,7 @@ def main() -> None:
     record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
     written, drawn = (harness.result_path(folder, "adaptive", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
-    draw(drawn, rows, found, size, harness.caption(about))
+    draw(drawn, rows, found, size, harness.format_caption(about))
     print(f"\nwritten: {written} and {drawn.name}")
 
 

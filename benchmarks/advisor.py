@@ -26,7 +26,7 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, tell
+from harness import Bar, print_progress
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from random_scenes import random_scene
@@ -34,74 +34,74 @@ from random_scenes import random_scene
 from physjax import methods
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
-from physjax.stepping.reference import discontinuities, in_dtype, ode_term
+from physjax.stepping.reference import cast_floats, discontinuities, ode_term
 from physjax.study.accuracy import error_measures, recommend
-from physjax.study.accuracy.method_facts import contender, copies, smallest_size
-from physjax.study.accuracy.recommend import candidates
-from physjax.study.accuracy.reference_solution import yardstick
-from physjax.study.accuracy.search import Question, explored, timed_in_turn
+from physjax.study.accuracy.method_facts import compile_run, smallest_size, stack_copies
+from physjax.study.accuracy.recommend import list_candidates
+from physjax.study.accuracy.reference_solution import solve_reference
+from physjax.study.accuracy.search import SearchTask, explore_method, time_in_turn
 from physjax.study.problem import Problem
 
 ERRORS = (1e-2, 1e-4, 1e-6)
-RANDOM = 40
+RANDOM_SCENES = 40
 BATCH = 1000
 SOLVERS = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno5")
-WITHIN = 1.5
-DENSE = 20
+ALLOWED_TIME_RATIO = 1.5
+KVAERNO_STATE_LIMIT = 20
 """Numbers in a state beyond which Kvaerno5 is left out: its thousand dense solves a step take minutes to hours a run."""
-SLOW = 15.0
+SLOW_RUN_SECONDS = 15.0
 """Seconds of a rival's run that end its refinement."""
-PART = {"solar_system": 0.05, "hanging_rope": 0.1, "flag": 0.1, "hanging_cloth": 0.1}
+DURATION_SHARES = {"solar_system": 0.05, "hanging_rope": 0.1, "flag": 0.1, "hanging_cloth": 0.1}
 """Of the duration, for scenes whose thousand copies would otherwise take every solver minutes a run."""
 
 
-def problem_of(name):
+def build_problem(name):
     """A scene of the gallery, or `random:SEED`."""
     with jax.enable_x64(True):
         kind, _, seed = name.partition(":")
         return Problem(*random_scene(int(seed))) if kind == "random" else SCENES[name]()
 
 
-def promises(name):
+def check_promises(name):
     """One search for three errors, its promises checked, its runs against the fastest of an exhaustive search."""
-    problem = problem_of(name)
+    problem = build_problem(name)
     started, busy = time.perf_counter(), time.process_time()
     answers = recommend(problem.scene, error=ERRORS, horizon=problem.duration, frames=problem.frames, progress=False)
     seconds, busy = time.perf_counter() - started, time.process_time() - busy
     with jax.enable_x64(True):
         second = methods.rk4 if problem.is_ode else methods.verlet
-        other = yardstick(problem, wanted=1e-7, seconds=6.0, own=None if problem.exact is not None else second)
-        doubt = float(other.doubt().max())
-        runs = exhaustive(problem, answers)
-        rows = [judged(problem, other, doubt, advice, runs) for advice in answers]
+        other = solve_reference(problem, wanted=1e-7, seconds=6.0, own=None if problem.exact is not None else second)
+        truth_error = float(other.truth_error().max())
+        runs = search_exhaustively(problem, answers)
+        rows = [judge_promise(problem, other, truth_error, advice, runs) for advice in answers]
     return {
         "seconds": seconds,
         "busy": busy,
         "truth": answers[0].truth,
         "other": other.source,
-        "doubt": doubt,
+        "doubt": truth_error,
         "answers": rows,
     }
 
 
-def exhaustive(problem, answers):
+def search_exhaustively(problem, answers):
     """(contender, run) of every method in float64, √2 apart."""
     entries = [*METHODS.values(), methods.adaptive(methods.rk4)]
     if not problem.is_ode:
-        entries = candidates(problem.scene)[:3]
+        entries = list_candidates(problem.scene)[:3]
     slowest = max((a.best.seconds * problem.duration for a in answers if a.ok), default=0.1)
-    truth = yardstick(problem._replace(exact=None), wanted=min(ERRORS))
-    question = Question(problem, truth, error_measures.path, None, None, time.process_time() + 30)
+    truth = solve_reference(problem._replace(exact=None), wanted=min(ERRORS))
+    task = SearchTask(problem, truth, error_measures.path, None, None, time.process_time() + 30)
     runs = []
     for method in entries:
-        entry = contender(problem, method)
+        entry = compile_run(problem, method)
         for start in (1.0,) if entry.adaptive else (1.0, np.sqrt(2.0)):
-            trials = explored(question, entry, min(ERRORS), (), start, longest=4 * slowest).trials
+            trials = explore_method(task, entry, min(ERRORS), (), start, longest=4 * slowest).trials
             runs += [(entry, trial) for trial in trials]
     return runs
 
 
-def judged(problem, other, doubt, advice, runs):
+def judge_promise(problem, other, truth_error, advice, runs):
     """A promise, kept or not, and its time beside that of the fastest run that keeps the same error."""
     row = {"error": advice.error, "ok": advice.ok, "reason": advice.reason, "evidence": advice.evidence}
     if not advice.ok:
@@ -109,43 +109,43 @@ def judged(problem, other, doubt, advice, runs):
     best = advice.best
     found = error_measures.path.error(other.scene, other.times, advice.simulate().state, other.states)
     row |= {"method": best.name, "dtype": best.dtype, "step": best.step, "promised": best.error, "found": found}
-    row |= {"checked": doubt < 0.2 * advice.error, "kept": bool(found <= advice.error + doubt)}
+    row |= {"checked": truth_error < 0.2 * advice.error, "kept": bool(found <= advice.error + truth_error)}
     good = [(entry, trial) for entry, trial in runs if trial.error <= advice.error]
     if good:
-        mine = contender(problem, best.method, best.dtype)
+        mine = compile_run(problem, best.method, best.dtype)
         fineness = 1 / best.tolerance if best.tolerance else float(best.steps_per_frame)
         # the few that look fastest take turns: a single look may have met a quiet moment
         few = sorted(good, key=lambda pair: pair[1].seconds)[:3]
         turns = [(mine, good[0][1]._replace(fineness=fineness)), *few]
-        own, *others = timed_in_turn([(entry, trial._replace(seconds=np.inf)) for entry, trial in turns])
+        own, *others = time_in_turn([(entry, trial._replace(seconds=np.inf)) for entry, trial in turns])
         fastest = int(np.argmin(others))
         row |= {"ratio": own / others[fastest], "fastest": few[fastest][0].name}
         row["its_step"] = few[fastest][0].dt(few[fastest][1].fineness)
     return row
 
 
-def crowd(scene, count):
+def perturb_copies(scene, count):
     """So many of a scene, their velocities (of bodies, momenta) changed by a percent at random."""
     rng = np.random.default_rng(0)
-    many = copies(scene, count)
+    many = stack_copies(scene, count)
     noise = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * jnp.abs(leaf), many.state)
-    return many.having(state=scene.kick(many.state, noise, 0.01))
+    return many.replace(state=scene.kick(many.state, noise, 0.01))
 
 
-def rivals(name):
+def compare_rivals(name):
     """A thousand copies: the recommended run beside diffrax's solvers at equal errors."""
-    problem = problem_of(name)
+    problem = build_problem(name)
     with jax.enable_x64(True):
-        single = in_dtype(problem.scene, jnp.float64)
-        duration = PART.get(name, 1.0) * problem.duration
-        many = problem._replace(scene=crowd(single, BATCH), duration=duration, exact=None)
+        single = cast_floats(problem.scene, jnp.float64)
+        duration = DURATION_SHARES.get(name, 1.0) * problem.duration
+        many = problem._replace(scene=perturb_copies(single, BATCH), duration=duration, exact=None)
         asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
         answers = recommend(many.scene, seconds=120, progress=False, **asked)
         # another truth than the search's, where that is diffrax's
-        truth = yardstick(many, wanted=1e-7, seconds=60.0, own=methods.rk4)
+        truth = solve_reference(many, wanted=1e-7, seconds=60.0, own=methods.rk4)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(single.state))
-        solvers = SOLVERS if numbers <= DENSE else SOLVERS[:-1]
-        found = [run for solver in solvers for run in rival_runs(single, many, truth, solver)]
+        solvers = SOLVERS if numbers <= KVAERNO_STATE_LIMIT else SOLVERS[:-1]
+        found = [run for solver in solvers for run in time_rival(single, many, truth, solver)]
     rows = []
     for advice in answers:
         good = [run for run in found if run["error"] <= advice.error]
@@ -164,7 +164,7 @@ def rivals(name):
 
 
 @partial(jax.jit, static_argnames=("solver", "frames"))
-def solved(scene, states, end, tol, size, solver, frames):
+def solve_copies(scene, states, end, tol, size, solver, frames):
     """Every copy by itself, with steps of its own."""
     import diffrax
 
@@ -191,21 +191,21 @@ def solved(scene, states, end, tol, size, solver, frames):
     return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), jax.vmap(one)(states))
 
 
-def rival_runs(single, many, truth, solver):
+def time_rival(single, many, truth, solver):
     """Error and least time of a solver at tolerances a power of ten apart."""
     runs = []
     for tol in 10.0 ** -np.arange(2, 12):
         size = smallest_size(single)
-        run = partial(solved, single, many.scene.state, many.duration, tol, size, solver, many.frames)
+        run = partial(solve_copies, single, many.scene.state, many.duration, tol, size, solver, many.frames)
         states = jax.tree.map(np.asarray, run())
         error = error_measures.path.error(truth.scene, truth.times, states, truth.states)
-        seconds = harness.stopwatch(run)
-        if seconds < SLOW:
-            seconds = min(seconds, *(harness.stopwatch(run) for _ in range(2)))
+        seconds = harness.time_call(run)
+        if seconds < SLOW_RUN_SECONDS:
+            seconds = min(seconds, *(harness.time_call(run) for _ in range(2)))
         if not np.isfinite(error):
             continue  # too loose to hold, and out of steps: a tighter one may hold, and be faster
         runs.append({"solver": solver, "tolerance": tol, "error": error, "seconds": seconds})
-        if seconds > SLOW or error < min(ERRORS):
+        if seconds > SLOW_RUN_SECONDS or error < min(ERRORS):
             break
     return runs
 
@@ -222,7 +222,10 @@ def report(record, folder, quick):
     bars = [
         Bar("promises kept, of those checked", float(np.mean(checked or [np.nan])), ">=", 0.98),
         Bar(
-            "recommended within 1.5x of the fastest", float(np.mean(np.array(ratios or [np.nan]) <= WITHIN)), ">=", 0.9
+            "recommended within 1.5x of the fastest",
+            float(np.mean(np.array(ratios or [np.nan]) <= ALLOWED_TIME_RATIO)),
+            ">=",
+            0.9,
         ),
         Bar("longest search [s of processor time]", max(searches, default=np.nan), "<=", 20.0),
         # where ours has no answer and diffrax has one, it is slower
@@ -235,13 +238,20 @@ def report(record, folder, quick):
     ]
     harness.print_table("promises", ["", "run", "step", "promised", "found", "time / fastest"], rows)
     rows = [
-        [label(raced_as(n), r), f"{r['ours']} {r['dtype']}", r["seconds"], r["diffrax"], r["its_seconds"], r["times"]]
+        [
+            label(label_scene(n), r),
+            f"{r['ours']} {r['dtype']}",
+            r["seconds"],
+            r["diffrax"],
+            r["its_seconds"],
+            r["times"],
+        ]
         for n, r in against
     ]
     harness.print_table(f"{BATCH} copies", ["", "ours", "[s]", "diffrax", "[s]", "times faster"], rows)
     stopped = [f"{label(n, r)}: {r['reason']}" for n, r in answers if not r["ok"]]
     print("\nNothing keeps the error:", *(stopped or ["-"]), sep="\n  ")
-    scenes, smooth = len(SCENES) + RANDOM, sum(problem_of(name).is_ode for name in SCENES)
+    scenes, smooth = len(SCENES) + RANDOM_SCENES, sum(build_problem(name).is_ode for name in SCENES)
     whole = [len(searches) == scenes] * 3 + [len(record["rivals"]) == smooth]
     done = f"{len(searches)} of {scenes} scenes, {len(record['rivals'])} of {smooth} beside diffrax"
     print(
@@ -254,21 +264,21 @@ def report(record, folder, quick):
     record["counted"] = {"done": done, "answers": len(answers), "stopped": len(stopped)}
     record["counted"] |= {"checked": len(checked), "timed": len(ratios), "against_diffrax": len(against)}
     if against:
-        foot = f"{harness.caption(record['machine'])}; {done}"
+        foot = f"{harness.format_caption(record['machine'])}; {done}"
         silent = [name for name, r in record["rivals"].items() if not any("times" in row for row in r["rows"])]
         draw(harness.result_path(folder, "advisor", quick, "png"), kept, against, silent, foot)
 
 
-def raced_as(name):
+def label_scene(name):
     """A scene's name, and how much of its duration its copies are run for where that is not all."""
-    return name.replace("_", " ") + (f" ({PART[name]:g} of it)" if name in PART else "")
+    return name.replace("_", " ") + (f" ({DURATION_SHARES[name]:g} of it)" if name in DURATION_SHARES else "")
 
 
 def draw(path, kept, against, silent, foot):
     """Promises against what was found; times beside the fastest; times beside diffrax."""
     from matplotlib.figure import Figure
 
-    from physjax.files import replacing
+    from physjax.files import write_atomically
 
     figure = Figure(figsize=(13, 5.4), layout="constrained")
     promise, ratio, rival = figure.subplots(1, 3)
@@ -282,7 +292,7 @@ def draw(path, kept, against, silent, foot):
         ratio.plot(np.linspace(0, 1, len(ratios)), ratios, color=colour)
         times = [(r["times"], names.index(name)) for name, r in against if r["error"] == error]
         rival.plot(*np.array(times).reshape(-1, 2).T, "o", color=colour)
-    for line, ax in ((1.0, promise), (WITHIN, ratio)):
+    for line, ax in ((1.0, promise), (ALLOWED_TIME_RATIO, ratio)):
         ax.axhline(line, color="0.3", linestyle="--", linewidth=1)
     rival.axvline(1.0, color="0.3", linestyle="--", linewidth=1)
     promise.set(xlabel="error promised [asked for]", ylabel="error by another truth [asked for]", xscale="log")
@@ -290,7 +300,7 @@ def draw(path, kept, against, silent, foot):
     ratio.set(xlabel="share of answers", ylabel="time [that of the fastest]", xlim=(0, 1))
     ratio.set_title("beside an exhaustive search")
     rival.set(xlabel=f"time of diffrax's best [ours], {BATCH} copies", xscale="log")
-    rival.set_yticks(range(len(names)), [raced_as(name) for name in names], fontsize=8)
+    rival.set_yticks(range(len(names)), [label_scene(name) for name in names], fontsize=8)
     rival.plot(
         [0.02] * len(silent), [names.index(n) for n in silent], "x", color="0.2", transform=rival.get_yaxis_transform()
     )
@@ -301,31 +311,31 @@ def draw(path, kept, against, silent, foot):
         ax.grid(color="0.92")
     promise.legend(frameon=False, fontsize=9)
     figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
-    with replacing(path, "wb") as file:
+    with write_atomically(path, "wb") as file:
         figure.savefig(file, format="png", dpi=110)
 
 
 def main():
     """Do what is not done yet, scene by scene, until the limit; then report."""
-    parser = harness.parser(__doc__)
+    parser = harness.build_parser(__doc__)
     parser.add_argument("--part", choices=("promises", "rivals", "report"), default="report")
     parser.add_argument("--scenes", nargs="*", help="names of the gallery, random:SEED; all by default")
     parser.add_argument("--limit", type=float, default=480.0, help="seconds after which no scene is begun")
-    given = harness.parsed(parser)
+    given = harness.parse_arguments(parser)
     path = harness.result_path(given.out, "advisor", given.quick, "json")
     record = json.loads(path.read_text()) if path.exists() else {"benchmark": "advisor", "promises": {}, "rivals": {}}
     started = time.perf_counter()
-    work = {"promises": promises, "rivals": rivals}
-    chosen = given.scenes or [*SCENES, *(f"random:{seed}" for seed in range(RANDOM) if given.part == "promises")]
+    work = {"promises": check_promises, "rivals": compare_rivals}
+    chosen = given.scenes or [*SCENES, *(f"random:{seed}" for seed in range(RANDOM_SCENES) if given.part == "promises")]
     for name in chosen if given.part in work else ():
         if name in record[given.part] or time.perf_counter() - started > given.limit:
             continue
-        if given.part == "rivals" and not problem_of(name).is_ode:
+        if given.part == "rivals" and not build_problem(name).is_ode:
             continue
         begun = time.perf_counter()
         record[given.part][name] = work[given.part](name)
-        record["machine"] = harness.machine()
-        tell(f"{name}: {time.perf_counter() - begun:.0f} s")
+        record["machine"] = harness.describe_machine()
+        print_progress(f"{name}: {time.perf_counter() - begun:.0f} s")
         harness.write_json(path, record)
         jax.clear_caches()
     if record["promises"]:

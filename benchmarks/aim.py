@@ -20,13 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from harness import Bar, tell
+from harness import Bar, print_progress
 
 from physjax import Particles, Scene, aim_at, forces, methods, ode_term, projectile, simulate, solve
 
 SPEED, MASS, STEPS = 40.0, 0.145, 200
 OURS, OTHER, PLAIN = harness.COLOURS  # families by colour only
-HIT = 1e-6
+HIT_DISTANCE = 1e-6
 """A target missed by no more than this is hit [m]."""
 
 
@@ -48,7 +48,7 @@ class Problem(NamedTuple):
     wind: jax.Array
 
 
-def scene(wind: jax.Array, velocity: jax.Array) -> Scene:
+def build_scene(wind: jax.Array, velocity: jax.Array) -> Scene:
     """A baseball that leaves the origin."""
     drag = forces.QuadraticDrag(area=4.3e-3, coefficient=0.35, wind=wind)
     return Scene(Particles(jnp.zeros_like(velocity), velocity), mass=MASS, forces=(forces.Gravity(), drag))
@@ -59,21 +59,21 @@ def direction(angle: jax.Array) -> jax.Array:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def problem(count: int) -> Problem:
+def build_problem(count: int) -> Problem:
     """Targets on the way down of shots at random angles, each in a wind of its own."""
     rng = np.random.default_rng(0)
     wind = jnp.asarray(rng.normal(scale=3.0, size=(count, 2)) * (1.0, 0.3))
     angle = jnp.asarray(rng.uniform(0.15, 1.3, count))
     time = rng.uniform(1.15, 1.8, count) * SPEED * jnp.sin(angle) / 9.8
-    start = scene(wind, SPEED * direction(angle))
+    start = build_scene(wind, SPEED * direction(angle))
     flight = simulate(start, methods.rk4, dt=time / STEPS, steps=STEPS, save_every=STEPS)
     return Problem(flight.position[-1], wind)
 
 
 @jax.jit
-def by_aim_at(given: Problem) -> tuple:
+def run_aim_at(given: Problem) -> tuple:
     """Angles and times of both arcs, and whether they hit."""
-    aimed = aim_at(scene(given.wind, jnp.zeros_like(given.wind)), given.target, speed=SPEED, steps=STEPS)
+    aimed = aim_at(build_scene(given.wind, jnp.zeros_like(given.wind)), given.target, speed=SPEED, steps=STEPS)
     return (aimed.low.angle, aimed.high.angle), (aimed.low.time, aimed.high.time), aimed.low.ok & aimed.high.ok
 
 
@@ -86,13 +86,17 @@ def guess(target: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @jax.jit
 @jax.vmap
-def by_solve(given: Problem) -> tuple:
+def run_solve(given: Problem) -> tuple:
     """Angle and flight time together, by `solve`."""
 
     def miss(unknown):
         angle, time = unknown
         flight = simulate(
-            scene(given.wind, SPEED * direction(angle)), methods.rk4, dt=time / STEPS, steps=STEPS, save_every=STEPS
+            build_scene(given.wind, SPEED * direction(angle)),
+            methods.rk4,
+            dt=time / STEPS,
+            steps=STEPS,
+            save_every=STEPS,
         )
         return flight.position[-1] - given.target
 
@@ -102,14 +106,14 @@ def by_solve(given: Problem) -> tuple:
 
 @jax.jit
 @jax.vmap
-def by_event(given: Problem) -> tuple:
+def run_event_search(given: Problem) -> tuple:
     """The angle alone: diffrax flies to the event, optimistix makes the range right."""
 
     def falls_through(t, y, args, **_):
         return y.position[1] - given.target[1]
 
     def landing(angle):
-        start = scene(given.wind, SPEED * direction(angle))
+        start = build_scene(given.wind, SPEED * direction(angle))
         return diffrax.diffeqsolve(
             ode_term(start),
             diffrax.Tsit5(),
@@ -134,9 +138,9 @@ def by_event(given: Problem) -> tuple:
 
 @jax.jit
 @jax.vmap
-def flown(given: Problem, angle: jax.Array, time: jax.Array) -> jax.Array:
+def measure_miss(given: Problem, angle: jax.Array, time: jax.Array) -> jax.Array:
     """By how much a shot misses [m], through diffrax at a tolerance of 1e-11, whoever found it."""
-    start = scene(given.wind, SPEED * direction(angle))
+    start = build_scene(given.wind, SPEED * direction(angle))
     end = diffrax.diffeqsolve(
         ode_term(start),
         diffrax.Dopri8(),
@@ -154,38 +158,38 @@ def flown(given: Problem, angle: jax.Array, time: jax.Array) -> jax.Array:
 
 FAMILIES = {OURS: "aim_at", OTHER: "optimistix over diffrax", PLAIN: "optimistix over simulate"}
 CONTENDERS = {
-    "aim_at, both arcs": by_aim_at,
-    "solve on angle and time, vmapped": by_solve,
-    "diffrax event + optimistix on the angle": by_event,
+    "aim_at, both arcs": run_aim_at,
+    "solve on angle and time, vmapped": run_solve,
+    "diffrax event + optimistix on the angle": run_event_search,
 }
 
 
-def judged(name: str, given: Problem, found: Any) -> list[Any]:
+def judge_hits(name: str, given: Problem, found: Any) -> list[Any]:
     """Name, share that hit, worst and median miss of those that were said to [m]."""
     angles, times, ok = found
     arcs = zip(angles, times, strict=True) if name.startswith("aim_at") else [(angles, times)]
-    miss = np.max([np.asarray(flown(given, angle, time)) for angle, time in arcs], axis=0)
-    good = np.asarray(ok) & (miss <= HIT)
+    miss = np.max([np.asarray(measure_miss(given, angle, time)) for angle, time in arcs], axis=0)
+    good = np.asarray(ok) & (miss <= HIT_DISTANCE)
     said = miss[np.asarray(ok)]
     return [name, float(good.mean()), float(np.asarray(ok).mean()), float(np.median(said)), float(said.max())]
 
 
 def main() -> None:
     """Run all contenders, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
-    given, accuracy = problem(size.targets), []
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
+    given, accuracy = build_problem(size.targets), []
     few = jax.tree.map(lambda leaf: leaf[: size.few], given)
-    problems = {name: few if run is by_solve else given for name, run in CONTENDERS.items()}
+    problems = {name: few if run is run_solve else given for name, run in CONTENDERS.items()}
     runs: dict[str, Callable] = {name: partial(run, problems[name]) for name, run in CONTENDERS.items()}
-    timings, failed = harness.side_by_side(
-        runs, size.repeats, check=lambda name, found: accuracy.append(judged(name, problems[name], found))
+    timings, failed = harness.time_side_by_side(
+        runs, size.repeats, check=lambda name, found: accuracy.append(judge_hits(name, problems[name], found))
     )
     if failed:
         raise SystemExit(f"{failed}")
     rows = [
-        harness.row(name, family, len(problems[name].target), timing)
+        harness.make_row(name, family, len(problems[name].target), timing)
         for family, (name, timing) in zip((OURS, PLAIN, OTHER), timings.items(), strict=True)
     ]
     ours, _, rival = (timings[name].least for name in CONTENDERS)
@@ -195,9 +199,9 @@ def main() -> None:
         Bar("aim_at: share of targets hit by both arcs", hits["aim_at, both arcs"], ">=", 1.0),
         Bar("aim_at: times faster than the event", rival / ours, ">=", 10.0),
     ]
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     harness.print_rates(f"{size.targets:,} targets", "targets a second", rows, "aim_at, both arcs")
-    head = ["", f"hit to {HIT:g} m", "said to hit", "median miss [m]", "worst miss [m]"]
+    head = ["", f"hit to {HIT_DISTANCE:g} m", "said to hit", "median miss [m]", "worst miss [m]"]
     harness.print_table("What was found, flown anew through diffrax; misses of those said to hit", head, accuracy)
     harness.print_bars(bars, quick)
     record = {"benchmark": "aim", "quick": quick, "machine": about, "settings": size._asdict(), "runs": rows}
@@ -206,7 +210,9 @@ def main() -> None:
     written, drawn = (harness.result_path(folder, "aim", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
     title = f"{size.targets:,} targets, drag and wind, float64"
-    harness.bar_chart(drawn, [(title, "targets per second (logarithmic)", rows)], harness.caption(about), FAMILIES)
+    harness.draw_bar_chart(
+        drawn, [(title, "targets per second (logarithmic)", rows)], harness.format_caption(about), FAMILIES
+    )
     print(f"\nwritten: {written} and {drawn.name}")
 
 

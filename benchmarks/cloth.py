@@ -19,16 +19,16 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, Missing, tell
+from harness import Bar, Missing, print_progress
 
 from physjax import Particles, Scene, forces, lattices, methods, simulate
 
 K, DAMPING, MASS, G, DT, SPACING = 1000.0, 10.0, 0.1, 9.81, 1 / 960, 0.1
 OURS, _, OTHER = harness.COLOURS
 F = np.float32
-TRUTHS = {64: (3.1500, -4.0086, 2.6403), 128: (6.3500, -4.6847, 6.2180)}
+EXPECTED_MEANS = {64: (3.1500, -4.0086, 2.6403), 128: (6.3500, -4.6847, 6.2180)}
 """Mean positions [m] after a second, by N."""
-LOWEST = -4.9101
+EXPECTED_LOWEST = -4.9101
 """The lowest node after a second [m]: one that has not felt the corners yet, in free fall."""
 
 
@@ -64,27 +64,27 @@ class Contender(NamedTuple):
     run: Callable[[], Any]
 
 
-def hung(lattice: lattices.Lattice, pinned: np.ndarray) -> Scene:
+def build_scene(lattice: lattices.Lattice, pinned: np.ndarray) -> Scene:
     """A lattice with the case's masses, in float32, under gravity."""
     state = Particles(*(jnp.asarray(a, F) for a in lattice.state))
     return Scene(state, mass=MASS, forces=(forces.Gravity(g=G), lattice.springs), pinned=pinned)
 
 
-def grid(count: int) -> Scene:
+def build_grid(count: int) -> Scene:
     """NVIDIA's cloth of count × count nodes."""
     side, stiff = SPACING * (count - 1), {"structural": K, "shear": K, "bend": K, "damping": DAMPING}
     sheet = lattices.cloth(side, side, count, count, mass=MASS * count**2, down=(0, 0, 1), **stiff)
-    return hung(sheet, sheet.nodes["top"] & sheet.nodes["corners"])
+    return build_scene(sheet, sheet.nodes["top"] & sheet.nodes["corners"])
 
 
-def sphere(frequency: int) -> Scene:
+def build_sphere(frequency: int) -> Scene:
     """The same springs on a geodesic sphere of 10 frequency² + 2 nodes, two of them pinned."""
-    x, faces = geodesic(frequency)
+    x, faces = build_geodesic(frequency)
     ball = lattices.from_mesh(2 * x, faces, mass=MASS * len(x), structural=K, bend=K, damping=DAMPING)
-    return hung(ball, np.arange(len(x)) < 2)
+    return build_scene(ball, np.arange(len(x)) < 2)
 
 
-def geodesic(frequency: int) -> tuple[np.ndarray, np.ndarray]:
+def build_geodesic(frequency: int) -> tuple[np.ndarray, np.ndarray]:
     """An icosahedron whose faces are cut into frequency² triangles, blown up to a sphere of radius 1."""
     p = (1 + 5**0.5) / 2
     corners = np.array([[0, a, b * p] for a in (-1, 1) for b in (-1, 1)])
@@ -112,14 +112,14 @@ def geodesic(frequency: int) -> tuple[np.ndarray, np.ndarray]:
     return x / np.sqrt((x * x).sum(-1, keepdims=True)), same.ravel()[np.array(faces)]
 
 
-def case(scene: Scene) -> Case:
+def build_case(scene: Scene) -> Case:
     """What a scene is made of, for those who do not know scenes."""
     springs = scene.forces[1]
     pinned = np.asarray(scene.pinned)
     return Case(np.asarray(scene.state.position), springs.pairs, np.asarray(springs.rest_length), 1 - pinned.astype(F))
 
 
-def ended(scene: Scene, steps: int) -> jax.Array:
+def simulate_final(scene: Scene, steps: int) -> jax.Array:
     """Final positions through the public `simulate`."""
     run = simulate(scene, methods.semi_implicit_euler, dt=DT, steps=steps, save_every=steps)
     return run.final_scene.state.position
@@ -127,10 +127,10 @@ def ended(scene: Scene, steps: int) -> jax.Array:
 
 def with_physjax(scene: Scene, steps: int) -> Iterator[Contender]:
     """The layout that was chosen."""
-    yield Contender(f"physjax, {scene.forces[1].layout}", OURS, partial(ended, scene, steps))
+    yield Contender(f"physjax, {scene.forces[1].layout}", OURS, partial(simulate_final, scene, steps))
 
 
-def numpy_steps(given: Case, steps: int, kind: Any = F) -> np.ndarray:
+def run_numpy(given: Case, steps: int, kind: Any = F) -> np.ndarray:
     """The same step in NumPy: forces on springs, summed at their ends by bincount."""
     x, rest, free = (a.astype(kind) for a in (given.x, given.rest, given.free))
     (i, j), v = given.pairs.T, np.zeros_like(x)
@@ -148,12 +148,12 @@ def numpy_steps(given: Case, steps: int, kind: Any = F) -> np.ndarray:
 
 def with_numpy(scene: Scene, steps: int) -> Iterator[Contender]:
     """NumPy, spring by spring in arrays."""
-    yield Contender("NumPy", OTHER, partial(numpy_steps, case(scene), steps))
+    yield Contender("NumPy", OTHER, partial(run_numpy, build_case(scene), steps))
 
 
 def with_warp(scene: Scene, steps: int) -> Iterator[Contender]:
     """Warp on the CPU: a thread for each spring, which adds to both ends, then a thread for each node."""
-    wp = harness.optional("warp", "warp-lang")
+    wp = harness.import_optional("warp", "warp-lang")
     wp.config.quiet, wp.config.log_level = True, 30
     vectors, numbers = wp.array(dtype=wp.vec3), wp.array(dtype=float)
 
@@ -181,7 +181,7 @@ def with_warp(scene: Scene, steps: int) -> Iterator[Contender]:
         v[n] = u
         f[n] = wp.vec3()
 
-    given = case(scene)
+    given = build_case(scene)
     nodes, springs = len(given.x), len(given.pairs)
     on = {"device": "cpu"}
     pairs = wp.array(given.pairs.ravel(), dtype=int, **on)
@@ -203,9 +203,9 @@ def with_warp(scene: Scene, steps: int) -> Iterator[Contender]:
 
 def with_taichi(scene: Scene, steps: int) -> Iterator[Contender]:
     """Taichi on one thread, the kernels of Warp."""
-    ti = harness.optional("taichi")
+    ti = harness.import_optional("taichi")
     ti.init(arch=ti.cpu, cpu_max_num_threads=1, log_level=ti.WARN, offline_cache=False)
-    given = case(scene)
+    given = build_case(scene)
     nodes, springs = len(given.x), len(given.pairs)
     x, v, f = (ti.Vector.field(3, ti.f32, nodes) for _ in range(3))
     inverse, pairs = ti.field(ti.f32, nodes), ti.field(ti.i32, (springs, 2))
@@ -260,70 +260,73 @@ def race(scene: Scene, size: Settings) -> tuple[list[dict], dict[str, str]]:
         except Missing as reason:
             missing[source.__name__.removeprefix("with_")] = str(reason)
     contenders = {who.name: who for who in contenders}
-    given = case(scene)
-    truth = numpy_steps(given, size.steps, np.float64)
+    given = build_case(scene)
+    truth = run_numpy(given, size.steps, np.float64)
 
     def check(name, found):
         error = np.abs(np.asarray(found, float) - truth).max()
         if not error <= 1e-4:
             raise SystemExit(f"{name} is off by {error:.3g} m after {size.steps} steps.")
 
-    timings, failed = harness.side_by_side({n: who.run for n, who in contenders.items()}, size.repeats, check)
+    timings, failed = harness.time_side_by_side({n: who.run for n, who in contenders.items()}, size.repeats, check)
     if any(contenders[name].family == OURS for name in failed):
         raise SystemExit(f"physjax failed: {failed}")
     work = len(given.x) * size.steps / 1e6
-    return [harness.row(n, contenders[n].family, work, t) for n, t in timings.items()], missing | failed
+    return [harness.make_row(n, contenders[n].family, work, t) for n, t in timings.items()], missing | failed
 
 
-def after_a_second(count: int) -> dict[str, Any]:
+def measure_second(count: int) -> dict[str, Any]:
     """Where a cloth is after a second, and how far from where it must be."""
-    x = np.asarray(ended(grid(count), 960), float)
-    error = float(np.abs(x.mean(axis=0) - TRUTHS[count]).max())
+    x = np.asarray(simulate_final(build_grid(count), 960), float)
+    error = float(np.abs(x.mean(axis=0) - EXPECTED_MEANS[count]).max())
     return {"mean": x.mean(axis=0).tolist(), "error": error, "lowest": float(x[:, 1].min())}
 
 
-def crowd(size: Settings) -> list[dict]:
+def race_copies(size: Settings) -> list[dict]:
     """(c): many small cloths in one vmap, beside one cloth of about as many nodes."""
-    small, side = grid(16), round((256 * size.cloths) ** 0.5)
+    small, side = build_grid(16), round((256 * size.cloths) ** 0.5)
     states = jax.tree.map(lambda a: jnp.tile(a, (size.cloths, 1, 1)), small.state)
 
     def alone(state):
-        return ended(eqx.tree_at(lambda scene: scene.state, small, state), size.steps)
+        return simulate_final(eqx.tree_at(lambda scene: scene.state, small, state), size.steps)
 
     many, large = f"{size.cloths} cloths of 16 x 16, vmap", f"one cloth of {side} x {side}"
-    runs = {many: partial(jax.jit(jax.vmap(alone)), states), large: partial(ended, grid(side), size.steps)}
-    timings, failed = harness.side_by_side(runs, size.repeats)
+    runs = {
+        many: partial(jax.jit(jax.vmap(alone)), states),
+        large: partial(simulate_final, build_grid(side), size.steps),
+    }
+    timings, failed = harness.time_side_by_side(runs, size.repeats)
     if failed:
         raise SystemExit(f"physjax failed: {failed}")
     nodes = {many: 256 * size.cloths, large: side**2}
-    return [harness.row(name, OURS, nodes[name] * size.steps / 1e6, timing) for name, timing in timings.items()]
+    return [harness.make_row(name, OURS, nodes[name] * size.steps / 1e6, timing) for name, timing in timings.items()]
 
 
-def step_bytes(count: int) -> int:
+def measure_step_bytes(count: int) -> int:
     """Memory of a compiled step of count × count nodes, with what goes in and what comes out [bytes]."""
-    scene = grid(count)
+    scene = build_grid(count)
     step = jax.jit(lambda scene: scene.step(methods.semi_implicit_euler, 0.0, DT).state)
     held = step.lower(scene).compile().memory_analysis()
-    constants = scene.forces[1].network.present.size
+    constants = scene.forces[1].topology.present.size
     return held.temp_size_in_bytes + held.argument_size_in_bytes + held.output_size_in_bytes + constants
 
 
 def main() -> None:
     """Run all studies, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
-    scenes = {f"cloth {n} x {n}": grid(n) for n in size.grids}
-    scenes[f"mesh, {10 * size.frequency**2 + 2:,} nodes"] = sphere(size.frequency)
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
+    scenes = {f"cloth {n} x {n}": build_grid(n) for n in size.grids}
+    scenes[f"mesh, {10 * size.frequency**2 + 2:,} nodes"] = build_sphere(size.frequency)
     tables, missing = {}, {}
     for name, scene in scenes.items():
-        tell(name)
+        print_progress(name)
         tables[name], reasons = race(scene, size)
         missing |= reasons
-    tell("a thousand cloths, a second, memory")
-    tables["many cloths"] = crowd(size)
-    ends = {} if quick else {n: after_a_second(n) for n in TRUTHS}
-    memory = step_bytes(size.many)
+    print_progress("a thousand cloths, a second, memory")
+    tables["many cloths"] = race_copies(size)
+    ends = {} if quick else {n: measure_second(n) for n in EXPECTED_MEANS}
+    memory = measure_step_bytes(size.many)
 
     bars = []
     for name, rows in tables.items():
@@ -340,11 +343,12 @@ def main() -> None:
         Bar(f"{n} x {n} after a second, mean position off by [m]", end["error"], "<=", 1e-3) for n, end in ends.items()
     ]
     bars += [
-        Bar(f"{n} x {n}, lowest node off by [m]", abs(end["lowest"] - LOWEST), "<=", 1e-3) for n, end in ends.items()
+        Bar(f"{n} x {n}, lowest node off by [m]", abs(end["lowest"] - EXPECTED_LOWEST), "<=", 1e-3)
+        for n, end in ends.items()
     ]
     bars.append(Bar(f"a step of {size.many**2:,} nodes [GB]", memory / 1e9, "<=", 1.0))
 
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     for name, rows in tables.items():
         harness.print_rates(name, "million node-steps/s", rows, rows[0]["name"])
     harness.print_bars(bars, quick)
@@ -357,7 +361,7 @@ def main() -> None:
     harness.write_json(written, record)
     unit = "million node-steps per second (logarithmic)"
     panels = [(f"{name}, springs with damping, float32", unit, rows) for name, rows in tables.items()]
-    harness.bar_chart(drawn, panels, harness.caption(about))
+    harness.draw_bar_chart(drawn, panels, harness.format_caption(about))
     print(f"\nwritten: {written} and {drawn.name}")
 
 

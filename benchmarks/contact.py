@@ -16,13 +16,13 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, tell
+from harness import Bar, print_progress
 
 from physjax import Particles, Scene, contacts, forces, methods, simulate
 
 OURS, LECTURE, BARE = harness.COLOURS  # families by colour only: all of this is physjax
 DT = 0.01
-RESTED = 400
+REST_STEPS = 400
 """Steps after which balls of restitution 0.5 lie or slide."""
 
 
@@ -49,12 +49,12 @@ CASES = {
     "restitution 1": Case(1.0),
     "restitution 0.8": Case(0.8),
     "restitution 0.8, Coulomb": Case(0.8, coulomb=True),
-    "at rest": Case(0.5, before=RESTED),
-    "at rest, Coulomb": Case(0.5, coulomb=True, before=RESTED),
+    "at rest": Case(0.5, before=REST_STEPS),
+    "at rest, Coulomb": Case(0.5, coulomb=True, before=REST_STEPS),
 }
 
 
-def balls(size: Settings, case: Case, response: Callable | None) -> Scene:
+def build_balls(size: Settings, case: Case, response: Callable | None) -> Scene:
     """The balls, over a floor unless `response` is None."""
     rng = np.random.default_rng(0)
     position, velocity = rng.uniform((-1, 0.2, -1), (1, 2, 1), (size.lanes, 3)), rng.normal(size=(size.lanes, 3))
@@ -78,11 +78,11 @@ def run(scene: Scene, method: Callable, size: Settings, first: Any) -> jax.Array
 RESPONSES = {"no contact": None, "project": contacts.project, "impact": contacts.impact}
 
 
-def contenders(method: Callable, case: Case, size: Settings) -> dict[str, Callable]:
+def build_contenders(method: Callable, case: Case, size: Settings) -> dict[str, Callable]:
     """Three runs of a case: without contact, with either response; the case's history is the same for both."""
     runs = {}
     for name, response in RESPONSES.items():
-        scene, first = balls(size, case, response), 0
+        scene, first = build_balls(size, case, response), 0
         if case.before and response is not None:
             earlier = simulate(scene, method, dt=DT, steps=case.before, save_every=case.before)
             scene, first = earlier.final_scene, earlier.final_step
@@ -92,9 +92,9 @@ def contenders(method: Callable, case: Case, size: Settings) -> dict[str, Callab
 
 def main() -> None:
     """Run all cases, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
     newest = tuple(int(part) for part in jax.__version__.split(".")[:2]) >= (0, 11)
     studies, ratios, bars, panels = [], [], [], []
     work = size.lanes * size.steps / 1e6
@@ -102,8 +102,10 @@ def main() -> None:
         for title, case in CASES.items():
             if method is methods.semi_implicit_euler and (case.coulomb or case.before):
                 continue
-            tell(f"{method.__name__}, {title}")
-            timings, failed = harness.side_by_side(contenders(method, case, size), size.repeats, check=_above_the_floor)
+            print_progress(f"{method.__name__}, {title}")
+            timings, failed = harness.time_side_by_side(
+                build_contenders(method, case, size), size.repeats, check=_check_floor
+            )
             if failed:
                 raise SystemExit(f"{title}: {failed}")
             bare, lecture, timed = (timings[name].least for name in RESPONSES)
@@ -118,7 +120,7 @@ def main() -> None:
                 ]
             )
             families = dict(zip(RESPONSES, (BARE, LECTURE, OURS), strict=True))
-            rows = [harness.row(name, families[name], work, timing) for name, timing in timings.items()]
+            rows = [harness.make_row(name, families[name], work, timing) for name, timing in timings.items()]
             studies.append({"method": method.__name__, "case": title, "runs": rows})
             if method is methods.rk4:
                 panels.append((f"rk4, {title}", "million particle-steps per second (logarithmic)", rows))
@@ -127,7 +129,7 @@ def main() -> None:
                 bars.append(Bar(f"{name}project / no contact", lecture / bare, "<=", most))
                 bars.append(Bar(f"{name}impact / project", timed / lecture, "<=", 4.0 if newest else 6.0))
 
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     head = [
         "",
         *(f"{name} [M/s]" for name in RESPONSES),
@@ -143,11 +145,11 @@ def main() -> None:
     written, drawn = (harness.result_path(folder, "contact", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
     names = dict(zip((BARE, LECTURE, OURS), RESPONSES, strict=True))
-    harness.bar_chart(drawn, panels, harness.caption(about), names)
+    harness.draw_bar_chart(drawn, panels, harness.format_caption(about), names)
     print(f"\nwritten: {written} and {drawn.name}")
 
 
-def _above_the_floor(name: str, position: jax.Array) -> None:
+def _check_floor(name: str, position: jax.Array) -> None:
     """What has contact must not have passed the floor; without, it must have, or nothing was tried."""
     lowest = float(position[:, 1].min())
     if (lowest < -1e-6) != (name == "no contact"):

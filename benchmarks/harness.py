@@ -31,20 +31,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what is measured
 import jax
 
 import physjax
-from physjax.files import replacing, writable_folder
+from physjax.files import ensure_writable_folder, write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "numba", "warp-lang", "taichi", "mujoco-mjx")
-TURN = 0.5
+TURN_SECONDS = 0.5
 """Seconds of a turn."""
 COLOURS = {"physjax": "#0072B2", "other JAX code": "#E69F00", "without JAX": "#999999"}
 """By family of contenders, from the palette of Okabe and Ito, which colour-blind readers tell apart, also in grey."""
 
 jax.config.update("jax_enable_compilation_cache", False)  # a cache on disk would hide what compiling costs
-_compiled: list[float] = []
+_compile_seconds: list[float] = []
 jax.monitoring.register_event_duration_secs_listener(
-    lambda event, seconds, **_: _compiled.append(seconds) if event.endswith("backend_compile_duration") else None
+    lambda event, seconds, **_: _compile_seconds.append(seconds) if event.endswith("backend_compile_duration") else None
 )
 
 
@@ -87,18 +87,18 @@ class Bar(NamedTuple):
 
 
 @contextmanager
-def compilations() -> Iterator[list[float]]:
+def record_compilations() -> Iterator[list[float]]:
     """Seconds of every compilation by XLA inside the block, in a list that is filled when the block ends."""
-    start, seen = len(_compiled), []
+    start, seen = len(_compile_seconds), []
     yield seen
-    seen.extend(_compiled[start:])
+    seen.extend(_compile_seconds[start:])
 
 
 class Missing(Exception):
     """Something that this machine lacks, in plain words."""
 
 
-def optional(module: str, package: str | None = None) -> Any:
+def import_optional(module: str, package: str | None = None) -> Any:
     """An installed module, or `Missing` with what to install."""
     try:
         return importlib.import_module(module)
@@ -106,9 +106,9 @@ def optional(module: str, package: str | None = None) -> Any:
         raise Missing(f"not installed (pip install {package or module})") from error
 
 
-def c_library(source: str) -> ctypes.CDLL:
+def compile_c(source: str) -> ctypes.CDLL:
     """C code compiled for this processor, as fast as the compiler can; `Missing` without a compiler."""
-    flags = ["-O3", "-march=native", "-ffast-math", *(["-mprefer-vector-width=512"] if avx512() else [])]
+    flags = ["-O3", "-march=native", "-ffast-math", *(["-mprefer-vector-width=512"] if has_avx512() else [])]
     with tempfile.TemporaryDirectory() as folder:
         code, binary = Path(folder) / "code.c", Path(folder) / "code.so"
         code.write_text(source)
@@ -122,7 +122,7 @@ def c_library(source: str) -> ctypes.CDLL:
         return ctypes.CDLL(str(binary))
 
 
-def side_by_side(
+def time_side_by_side(
     contenders: Mapping[str, Callable[[], Any]],
     repeats: int,
     check: Callable[[str, Any], None] = lambda name, found: None,
@@ -134,7 +134,7 @@ def side_by_side(
     firsts, failed = {}, {}
     for name, run in contenders.items():
         start = time.perf_counter()
-        with compilations() as compiling:
+        with record_compilations() as compiling:
             try:
                 found = jax.block_until_ready(run())
             except Exception as error:
@@ -142,38 +142,38 @@ def side_by_side(
                 continue
         firsts[name] = time.perf_counter() - start, sum(compiling)
         check(name, found)
-        tell(f"  {name}: first call {firsts[name][0]:.2f} s")
+        print_progress(f"  {name}: first call {firsts[name][0]:.2f} s")
     taken = {name: [] for name in firsts}
     for _ in range(repeats):
         for name, times in taken.items():
-            times.append(turn(contenders[name]))
+            times.append(time_turn(contenders[name]))
     return {name: Timing(*firsts[name], *zip(*times, strict=True)) for name, times in taken.items()}, failed
 
 
-def turn(run: Callable[[], Any]) -> tuple[float, float]:
+def time_turn(run: Callable[[], Any]) -> tuple[float, float]:
     """Mean seconds and processor seconds of a call, over calls that fill a turn after one that does not count.
 
     A call that fills the turn by itself is not repeated.
     """
     calls, busy = 0, time.process_time()
-    warming = stopwatch(run)
-    if warming >= TURN:
+    warming = time_call(run)
+    if warming >= TURN_SECONDS:
         return warming, time.process_time() - busy
     start, busy = time.perf_counter(), time.process_time()
-    while calls == 0 or time.perf_counter() - start < TURN:
+    while calls == 0 or time.perf_counter() - start < TURN_SECONDS:
         jax.block_until_ready(run())
         calls += 1
     return (time.perf_counter() - start) / calls, (time.process_time() - busy) / calls
 
 
-def stopwatch(run: Callable[[], Any]) -> float:
+def time_call(run: Callable[[], Any]) -> float:
     """Seconds until the result of a call is there [s]."""
     start = time.perf_counter()
     jax.block_until_ready(run())
     return time.perf_counter() - start
 
 
-def import_seconds(modules: Sequence[str], repeats: int) -> dict[str, float]:
+def time_imports(modules: Sequence[str], repeats: int) -> dict[str, float]:
     """What importing each module costs in a fresh process, the least of the repeats, taken in turn [s]."""
     seconds = {module: [] for module in modules}
     for _ in range(repeats):
@@ -184,12 +184,12 @@ def import_seconds(modules: Sequence[str], repeats: int) -> dict[str, float]:
     return {module: min(taken) for module, taken in seconds.items()}
 
 
-def temporary_bytes(function: Any, *arguments: Any) -> int:
+def measure_temporary_bytes(function: Any, *arguments: Any) -> int:
     """Memory that a compiled function needs besides its arguments and results [bytes]."""
     return function.lower(*arguments).compile().memory_analysis().temp_size_in_bytes
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """What was measured on: device, processor, cores this process may use, load, versions, flags."""
     device = jax.devices()[0]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
@@ -197,39 +197,40 @@ def machine() -> dict[str, Any]:
         "when": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "backend": jax.default_backend(),
         "device": device.device_kind,
-        "processor": _cpuinfo("model name") or platform.processor() or platform.machine(),
-        "avx512": avx512(),
+        "processor": _read_cpuinfo("model name") or platform.processor() or platform.machine(),
+        "avx512": has_avx512(),
         "cores": os.cpu_count(),
         "cores_used": len(cores) if cores else None,
         "affinity": cores,
         "load_average": os.getloadavg() if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "versions": {"physjax": physjax.__version__} | {name: found for name in PACKAGES if (found := _version(name))},
-        "compiler": _compiler(),
+        "versions": {"physjax": physjax.__version__}
+        | {name: found for name in PACKAGES if (found := _find_version(name))},
+        "compiler": _find_compiler(),
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
     }
 
 
-def caption(about: Mapping[str, Any]) -> str:
+def format_caption(about: Mapping[str, Any]) -> str:
     """The machine in a line."""
     what = about["processor"] if about["backend"] == "cpu" else f"{about['device']}, host {about['processor']}"
     used = f"{about['cores_used']} of {about['cores']} cores" if about["cores_used"] else f"{about['cores']} cores"
     return f"{what}, {used}; jax {jax.__version__}, Python {about['python']}, {about['when']}"
 
 
-def avx512() -> bool:
+def has_avx512() -> bool:
     """Whether the processor has 512-bit vectors."""
-    return "avx512f" in (_cpuinfo("flags") or "").split()
+    return "avx512f" in (_read_cpuinfo("flags") or "").split()
 
 
-def options(about: str) -> tuple[bool, Path]:
+def parse_options(about: str) -> tuple[bool, Path]:
     """The command line: whether to be quick, and the folder of the results, tried before the work."""
-    given = parsed(parser(about))
+    given = parse_arguments(build_parser(about))
     return given.quick, given.out
 
 
-def parser(about: str) -> argparse.ArgumentParser:
+def build_parser(about: str) -> argparse.ArgumentParser:
     """The options that every benchmark has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small sizes: shows that everything runs, proves nothing")
@@ -237,11 +238,11 @@ def parser(about: str) -> argparse.ArgumentParser:
     return parser
 
 
-def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """What was given, the folder of the results tried."""
     given = parser.parse_args()
     try:
-        given.out = writable_folder(given.out)
+        given.out = ensure_writable_folder(given.out)
     except OSError as error:
         parser.error(str(error))
     return given
@@ -255,7 +256,7 @@ def result_path(folder: Path, name: str, quick: bool, ending: str) -> Path:
 
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
     """The record as a file that is whole or absent."""
-    with replacing(path) as file:
+    with write_atomically(path) as file:
         json.dump(record, file, indent=1, ensure_ascii=False)
         file.write("\n")
 
@@ -274,7 +275,7 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) 
             print("  " + "  ".join("-" * width for width in widths))
 
 
-def row(name: str, family: str, work: float, timing: Timing) -> dict[str, Any]:
+def make_row(name: str, family: str, work: float, timing: Timing) -> dict[str, Any]:
     """A contender's result: its rate in units of `work` a second, the best and the median, and all its times [s]."""
     return {
         "name": name,
@@ -321,7 +322,7 @@ def print_bars(bars: Sequence[Bar], quick: bool) -> None:
     print_table("Bars" + (", not judged in a quick run" if quick else ""), ["", "measured", "wanted", ""], lines)
 
 
-def bar_chart(
+def draw_bar_chart(
     path: Path,
     panels: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]],
     foot: str,
@@ -346,7 +347,7 @@ def bar_chart(
         axis.scatter([row["median_rate"] for row in rows], names, marker="|", s=90, color="black", zorder=3)
         axis.set_xscale("log")
         axis.set_xlim(10 ** math.floor(math.log10(min(best) / 1.2)), max(best) * 2.2)
-        axis.bar_label(axis.containers[0], labels=[_short(value) for value in best], fontsize=9, padding=3)
+        axis.bar_label(axis.containers[0], labels=[_format_rate(value) for value in best], fontsize=9, padding=3)
         axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set_title(title, loc="left", fontsize=11)
@@ -358,20 +359,20 @@ def bar_chart(
     keys = [Patch(color=colour, label=(labels or {}).get(family, family)) for family, colour in COLOURS.items()]
     figure.legend(handles=keys, loc="outside upper right", ncols=len(keys), frameon=False)
     figure.supxlabel(f"{foot}\nbar: best of the turns, tick: their median", fontsize=8, x=0.01, ha="left")
-    with replacing(path, "wb") as file:
+    with write_atomically(path, "wb") as file:
         figure.savefig(file, format="png", dpi=150)
 
 
-def tell(what: str) -> None:
+def print_progress(what: str) -> None:
     """Progress, apart from the results."""
     print(what, file=sys.stderr, flush=True)
 
 
-def _short(value: float) -> str:
+def _format_rate(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _cpuinfo(field: str) -> str | None:
+def _read_cpuinfo(field: str) -> str | None:
     try:
         text = Path("/proc/cpuinfo").read_text()
     except OSError:
@@ -380,14 +381,14 @@ def _cpuinfo(field: str) -> str | None:
     return found[1].strip() if found else None
 
 
-def _version(package: str) -> str | None:
+def _find_version(package: str) -> str | None:
     try:
         return version(package)
     except PackageNotFoundError:
         return None
 
 
-def _compiler() -> str | None:
+def _find_compiler() -> str | None:
     try:
         return subprocess.run(["cc", "--version"], capture_output=True, text=True, check=True).stdout.splitlines()[0]
     except (OSError, subprocess.CalledProcessError, IndexError):

@@ -21,17 +21,17 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, Missing, tell
+from harness import Bar, Missing, print_progress
 
 from physjax import Particles, Scene, forces, lattices, methods, simulate
-from physjax.files import replacing
+from physjax.files import write_atomically
 from physjax.stepping.implicit import ImplicitEuler
 from physjax.stepping.krylov import conjugate_gradients
-from physjax.stepping.reference import in_dtype
+from physjax.stepping.reference import cast_floats
 
-DT, LOOSE = 1 / 60, 1e-3
-GAMES = ImplicitEuler(tolerance=LOOSE)
-LIU = {"their fast solver": 50.0, "Newton": 13_000.0}
+DT, RESIDUAL_TOLERANCE = 1 / 60, 1e-3
+GAME_METHOD = ImplicitEuler(tolerance=RESIDUAL_TOLERANCE)
+LIU_FRAME_MS = {"their fast solver": 50.0, "Newton": 13_000.0}
 """What Liu et al. report for a frame [ms], on their machine."""
 COLOURS = {"implicit_euler": "#0072B2", "semi_implicit_euler": "#E69F00", "rk4": "#009E73"}
 
@@ -50,7 +50,7 @@ FULL = Settings(81, 90, 15, 5, 5)
 QUICK = Settings(17, 6, 3, 2, 1)
 
 
-def cloth(side: int, dtype: Any = np.float32) -> Scene:
+def build_cloth(side: int, dtype: Any = np.float32) -> Scene:
     """The cloth, with its weight."""
     sheet = lattices.cloth(1.0, 1.0, side, side, mass=1.0, structural=1000.0, shear=1000.0, bend=100.0)
     state = Particles(*(jnp.asarray(leaf, dtype) for leaf in sheet.state))
@@ -58,16 +58,16 @@ def cloth(side: int, dtype: Any = np.float32) -> Scene:
     return Scene(state, mass=sheet.mass, forces=(forces.Gravity(), sheet.springs), pinned=pinned)
 
 
-def frame_by_frame(scene: Scene, frames: int) -> tuple[list[float], list[int], list[float], Scene]:
+def time_frames(scene: Scene, frames: int) -> tuple[list[float], list[int], list[float], Scene]:
     """Seconds, products with the matrix and relative residual of each frame, each called by itself; the scene half way."""
-    step = partial(simulate, method=GAMES, dt=DT, steps=1)
+    step = partial(simulate, method=GAME_METHOD, dt=DT, steps=1)
     jax.block_until_ready(step(scene).state)
     seconds, products, residuals, middle = [], [], [], scene
     for i in range(frames):
         start = time.perf_counter()
         after = jax.block_until_ready(step(scene, first_step=i).final_scene)
         seconds.append(time.perf_counter() - start)
-        report = GAMES.report(scene, DT)
+        report = GAME_METHOD.report(scene, DT)
         products.append(int(report.products))
         residuals.append(float(report.residual))
         scene = after
@@ -76,17 +76,17 @@ def frame_by_frame(scene: Scene, frames: int) -> tuple[list[float], list[int], l
     return seconds, products, residuals, middle
 
 
-def system(scene: Scene) -> tuple[Any, jax.Array]:
+def build_system(scene: Scene) -> tuple[Any, jax.Array]:
     """The matrix of a linearised step, as a function, and its right-hand side; nodes are equally heavy."""
-    near = scene.near(DT, scene.state)
+    linearised = scene.linearised_at(DT, scene.state)
     x, v = scene.state
-    a, push = jax.linearize(lambda x, v: near.acceleration(DT, Particles(x, v)), x, v)
+    a, push = jax.linearize(lambda x, v: linearised.acceleration(DT, Particles(x, v)), x, v)
     return lambda u: u - DT * push(DT * u, u), DT * (a + push(DT * v, jnp.zeros_like(v)))
 
 
-def linear_contenders(scene: Scene) -> dict[str, Any]:
+def build_linear_contenders(scene: Scene) -> dict[str, Any]:
     """The linear system of a step to the same residual, by ours, by lineax and by a round of optimistix's Newton method."""
-    lx, optx = harness.optional("lineax"), harness.optional("optimistix")
+    lx, optx = harness.import_optional("lineax"), harness.import_optional("optimistix")
     two_norm = lambda r: jnp.sqrt(jnp.sum(r * r))  # noqa: E731
     inner = lambda a, b: jnp.sum(a[0] * b[0])  # noqa: E731
 
@@ -95,7 +95,7 @@ def linear_contenders(scene: Scene) -> dict[str, Any]:
 
         @jax.jit
         def run(scene):
-            matvec, b = system(scene)
+            matvec, b = build_system(scene)
             u = solve(matvec, b)
             r = b - matvec(u)
             return u, jnp.sqrt(jnp.sum(r * r) / jnp.sum(b * b))
@@ -103,7 +103,7 @@ def linear_contenders(scene: Scene) -> dict[str, Any]:
         return partial(run, scene)
 
     def ours(matvec, b):
-        return conjugate_gradients(lambda u: [matvec(u[0])], [b], inner, LOOSE, 1000)[0][0]
+        return conjugate_gradients(lambda u: [matvec(u[0])], [b], inner, RESIDUAL_TOLERANCE, 1000)[0][0]
 
     def lineax(matvec, b):
         size = two_norm(b)
@@ -111,12 +111,12 @@ def linear_contenders(scene: Scene) -> dict[str, Any]:
             matvec, jax.ShapeDtypeStruct(b.shape, b.dtype), lx.positive_semidefinite_tag
         )
         # its relative tolerance is meant entry by entry: an absolute one, and a right-hand side of norm 1
-        solver = lx.CG(rtol=0.0, atol=LOOSE, norm=two_norm, max_steps=1000)
+        solver = lx.CG(rtol=0.0, atol=RESIDUAL_TOLERANCE, norm=two_norm, max_steps=1000)
         return size * lx.linear_solve(operator, b / size, solver, throw=False).value
 
     def optimistix(matvec, b):
         size = two_norm(b)
-        solver = lx.CG(rtol=0.0, atol=LOOSE, norm=two_norm, max_steps=1000)
+        solver = lx.CG(rtol=0.0, atol=RESIDUAL_TOLERANCE, norm=two_norm, max_steps=1000)
         newton = optx.Newton(rtol=1.0, atol=1.0, norm=two_norm, linear_solver=solver)
         tags = frozenset({lx.positive_semidefinite_tag})
         residual = lambda u, _: matvec(u) - b / size  # noqa: E731
@@ -130,11 +130,11 @@ def linear_contenders(scene: Scene) -> dict[str, Any]:
     }
 
 
-def converged_contenders(scene: Scene) -> dict[str, Any]:
+def build_newton_contenders(scene: Scene) -> dict[str, Any]:
     """The full equation of a step, u = dt a(x + dt (v + u), v + u), to the same residual, by ours and by optimistix."""
-    lx, optx = harness.optional("lineax"), harness.optional("optimistix")
+    lx, optx = harness.import_optional("lineax"), harness.import_optional("optimistix")
     two_norm = lambda r: jnp.sqrt(jnp.sum(r * r))  # noqa: E731
-    settled = ImplicitEuler(tolerance=LOOSE, newton=20)
+    converged = ImplicitEuler(tolerance=RESIDUAL_TOLERANCE, newton=20)
 
     def residual(u, scene):
         x, v = scene.state
@@ -149,14 +149,14 @@ def converged_contenders(scene: Scene) -> dict[str, Any]:
         return partial(run, scene)
 
     def ours(scene):
-        return settled(scene, 0.0, scene.state, jnp.asarray(DT, scene.state.dtype)).velocity - scene.state.velocity
+        return converged(scene, 0.0, scene.state, jnp.asarray(DT, scene.state.dtype)).velocity - scene.state.velocity
 
     def theirs(rounds):
         def solve(scene):
             start = jnp.zeros_like(scene.state.velocity)
             size = two_norm(residual(start, scene))
             # three digits of the first residual in each linear system, as ours; stopped by the number of rounds alone
-            linear = lx.BiCGStab(rtol=0.0, atol=LOOSE, norm=two_norm, max_steps=1000)
+            linear = lx.BiCGStab(rtol=0.0, atol=RESIDUAL_TOLERANCE, norm=two_norm, max_steps=1000)
             newton = optx.Newton(rtol=1e-12, atol=1e-12, norm=two_norm, linear_solver=linear)
             scaled = lambda u, scene: residual(u, scene) / size  # noqa: E731
             return optx.root_find(scaled, newton, start, scene, max_steps=rounds, throw=False).value
@@ -166,22 +166,24 @@ def converged_contenders(scene: Scene) -> dict[str, Any]:
     # as few rounds as reach the residual, or its best
     tries = {rounds: theirs(rounds) for rounds in range(1, 9)}
     found = {rounds: float(run()[1]) for rounds, run in tries.items()}
-    reached = [rounds for rounds, r in found.items() if r <= LOOSE] or [min(found, key=found.get)]
-    tell(f"  optimistix reaches {found[reached[0]]:.1e} in {reached[0]} rounds")
+    reached = [rounds for rounds, r in found.items() if r <= RESIDUAL_TOLERANCE] or [min(found, key=found.get)]
+    print_progress(f"  optimistix reaches {found[reached[0]]:.1e} in {reached[0]} rounds")
     return {"physjax, ImplicitEuler(newton=20)": measured(ours), "optimistix, Newton": tries[reached[0]]}
 
 
 def race(contenders: dict[str, Any], goal: float, repeats: int) -> list[dict]:
     """Milliseconds and residual of each contender; one that failed says why."""
     rows, found = [], {}
-    timings, failed = harness.side_by_side(contenders, repeats, lambda name, run: found.update({name: float(run[1])}))
+    timings, failed = harness.time_side_by_side(
+        contenders, repeats, lambda name, run: found.update({name: float(run[1])})
+    )
     for name, timing in timings.items():
         row = {"name": name, "ms": 1e3 * timing.least, "median_ms": 1e3 * timing.median, "residual": found[name]}
         rows.append(row | {"converged": found[name] <= 1.5 * goal, "first_call_s": timing.first})
     return rows + [{"name": name, "failed": why} for name, why in failed.items()]
 
 
-def largest_frequency(scene: Scene) -> float:
+def find_largest_frequency(scene: Scene) -> float:
     """ω of the fastest oscillation at rest [rad/s], by 300 rounds of the power method."""
     x, v = scene.state
 
@@ -201,23 +203,23 @@ def largest_frequency(scene: Scene) -> float:
     return math.sqrt(float(power(jnp.asarray(start, x.dtype))))
 
 
-def truth(size: Settings, omega: float) -> np.ndarray:
+def compute_truth(size: Settings, omega: float) -> np.ndarray:
     """Positions at the horizon by rk4 in float64 at a quarter of its largest stable step."""
     with jax.enable_x64(True):
-        scene = cloth(size.side, np.float64)
+        scene = build_cloth(size.side, np.float64)
         steps = size.horizon * math.ceil(DT * omega / 0.7)
-        return np.asarray(ended(scene, methods.rk4, steps, size))
+        return np.asarray(simulate_final(scene, methods.rk4, steps, size))
 
 
-def ended(scene: Scene, method: Any, steps: int, size: Settings) -> jax.Array:
+def simulate_final(scene: Scene, method: Any, steps: int, size: Settings) -> jax.Array:
     """Positions at the horizon after so many steps."""
     run = simulate(scene, method, dt=size.horizon * DT / steps, steps=steps, save_every=steps)
     return run.final_scene.state.position
 
 
-def work_and_error(scene: Scene, size: Settings, omega: float) -> list[dict]:
+def measure_work_and_error(scene: Scene, size: Settings, omega: float) -> list[dict]:
     """Error after the horizon and time of a frame, for each method from its longest useful step down."""
-    exact = truth(size, omega)
+    exact = compute_truth(size, omega)
     coarsest = {
         "implicit_euler": 1,
         "semi_implicit_euler": math.ceil(DT * omega / 1.9),
@@ -225,13 +227,13 @@ def work_and_error(scene: Scene, size: Settings, omega: float) -> list[dict]:
     }
     rows = []
     for name, fewest in coarsest.items():
-        method = GAMES if name == "implicit_euler" else getattr(methods, name)
+        method = GAME_METHOD if name == "implicit_euler" else getattr(methods, name)
         for n in [fewest * 2**i for i in range(size.refinements if name == "implicit_euler" else 3)]:
-            run = partial(ended, scene, method, n * size.horizon, size)
+            run = partial(simulate_final, scene, method, n * size.horizon, size)
             error = float(np.sqrt(np.mean((np.asarray(run(), float) - exact) ** 2)))
-            ms = 1e3 * min(harness.stopwatch(run) for _ in range(size.repeats)) / size.horizon
+            ms = 1e3 * min(harness.time_call(run) for _ in range(size.repeats)) / size.horizon
             rows.append({"method": name, "steps_a_frame": n, "error": error, "ms": ms})
-            tell(f"  {name}, {n} steps a frame: {ms:.2f} ms a frame, error {error:.2e} m")
+            print_progress(f"  {name}, {n} steps a frame: {ms:.2f} ms a frame, error {error:.2e} m")
     return rows
 
 
@@ -261,35 +263,37 @@ def draw(path: Any, seconds: list[float], rows: list[dict], size: Settings, foot
     right.grid(alpha=0.3)
     right.legend(frameon=False)
     figure.supxlabel(foot, fontsize=8, x=0.01, ha="left")
-    with replacing(path, "wb") as file:
+    with write_atomically(path, "wb") as file:
         figure.savefig(file, format="png", dpi=150)
 
 
 def main() -> None:
     """Run all studies, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
-    scene = cloth(size.side)
-    tell("frames")
-    seconds, products, residuals, middle = frame_by_frame(scene, size.frames)
-    tell("linear system")
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
+    scene = build_cloth(size.side)
+    print_progress("frames")
+    seconds, products, residuals, middle = time_frames(scene, size.frames)
+    print_progress("linear system")
     races, missing = {}, {}
     try:
-        races["linear system"] = race(linear_contenders(middle), LOOSE, size.repeats)
+        races["linear system"] = race(build_linear_contenders(middle), RESIDUAL_TOLERANCE, size.repeats)
         with jax.enable_x64(True):
-            races["full equation"] = race(converged_contenders(in_dtype(middle, jnp.float64)), LOOSE, size.repeats)
+            races["full equation"] = race(
+                build_newton_contenders(cast_floats(middle, jnp.float64)), RESIDUAL_TOLERANCE, size.repeats
+            )
     except Missing as reason:
         missing["others"] = str(reason)
-    tell("error against time")
-    omega = largest_frequency(scene)
-    rows = work_and_error(scene, size, omega)
+    print_progress("error against time")
+    omega = find_largest_frequency(scene)
+    rows = measure_work_and_error(scene, size, omega)
 
     median = 1e3 * statistics.median(seconds)
     allowed = 75.0 if jax.__version_info__ < (0, 11) else 50.0
     bars = [
         Bar("median of the frames [ms]", median, "<=", allowed),
-        Bar("largest relative residual of a frame", max(residuals), "<=", LOOSE),
+        Bar("largest relative residual of a frame", max(residuals), "<=", RESIDUAL_TOLERANCE),
     ]
     for name, entries in races.items():
         ours, *others = entries
@@ -298,8 +302,10 @@ def main() -> None:
         good = [other for other in others if other.get("converged")]
         bars += [Bar(f"{name}, {other['name']} / ours [times]", other["ms"] / ours["ms"], ">=", 1.3) for other in good]
 
-    print(harness.caption(about))
-    print(f"frames: median {median:.1f} ms, {statistics.median(products)} products; Liu et al. report {LIU} ms")
+    print(harness.format_caption(about))
+    print(
+        f"frames: median {median:.1f} ms, {statistics.median(products)} products; Liu et al. report {LIU_FRAME_MS} ms"
+    )
     for name, entries in races.items():
         cells = [[e["name"], e["ms"], e["median_ms"], e["residual"], e["first_call_s"]] for e in entries if "ms" in e]
         harness.print_table(name, ["", "best [ms]", "median [ms]", "residual", "first call [s]"], cells)
@@ -310,13 +316,19 @@ def main() -> None:
     harness.print_bars(bars, quick)
     for name, reason in missing.items():
         print(f"left out: {name}, {reason}")
-    record = {"benchmark": "implicit", "quick": quick, "machine": about, "settings": size._asdict(), "reported_ms": LIU}
+    record = {
+        "benchmark": "implicit",
+        "quick": quick,
+        "machine": about,
+        "settings": size._asdict(),
+        "reported_ms": LIU_FRAME_MS,
+    }
     record |= {"seconds": seconds, "products": products, "residuals": residuals, "races": races, "left_out": missing}
     record |= {"largest_frequency": omega, "error_against_time": rows}
     record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
     written, drawn = (harness.result_path(folder, "implicit", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
-    draw(drawn, seconds, rows, size, harness.caption(about))
+    draw(drawn, seconds, rows, size, harness.format_caption(about))
     print(f"\nwritten: {written} and {drawn.name}")
 
 

@@ -16,12 +16,12 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, Missing, tell
+from harness import Bar, Missing, print_progress
 
 from physjax import Scene, contacts, emitters, forces, methods, simulate
 
 DT, MASS, AREA, DRAG, WIND, G = 0.01, 1e-3, 1e-4, 0.5, (1.0, 0.0, 0.0), 9.8
-SPEED, CONE, BOUNCE, SLIDE, LIFE = 8.0, 0.4, 0.5, 0.1, 4.9
+SPEED, CONE, RESTITUTION, FRICTION, LIFE_SECONDS = 8.0, 0.4, 0.5, 0.1, 4.9
 K = 0.5 * 1.225 * DRAG * AREA / MASS
 OURS, OTHER = "physjax", "without JAX"
 
@@ -39,7 +39,7 @@ FULL = Settings(100_000, 1_000_000, 100, 7)
 QUICK = Settings(2_000, 5_000, 20, 1)
 
 
-def spray(
+def build_run(
     lanes: int,
     emits: bool,
     method: Callable = methods.semi_implicit_euler,
@@ -49,9 +49,9 @@ def spray(
     """A run from the steady state on; without births from the same places and speeds."""
     up = (0.0, 1.0, 0.0)
     source = emitters.Point((0.0, 1.0, 0.0))
-    options = {"life": LIFE, "speed": SPEED, "direction": up, "cone": CONE, "speed_spread": 0.2}
+    options = {"life": LIFE_SECONDS, "speed": SPEED, "direction": up, "cone": CONE, "speed_spread": 0.2}
     jet = emitters.Emitter(lanes, source, key=0, rate=lanes / 5, **options)
-    floor = contacts.Plane((0.0, 0.0, 0.0), up, restitution=BOUNCE, friction=SLIDE, response=response)
+    floor = contacts.Plane((0.0, 0.0, 0.0), up, restitution=RESTITUTION, friction=FRICTION, response=response)
     parts = (MASS, (forces.Gravity(G), forces.QuadraticDrag(AREA, DRAG, wind=WIND)), (floor,))
     scene = simulate(
         Scene(jet.unborn(np.float32), *parts, emitter=jet), method, dt=DT, steps=warm, save_every=warm
@@ -80,9 +80,9 @@ def with_numpy(lanes: int, steps: int) -> Callable:
             low = x[1] < 0
             x[1, low] = 0
             inward = low & (v[1] < 0)
-            v[0, inward] *= np.float32(1 - SLIDE)
-            v[2, inward] *= np.float32(1 - SLIDE)
-            v[1, inward] *= np.float32(-BOUNCE)
+            v[0, inward] *= np.float32(1 - FRICTION)
+            v[2, inward] *= np.float32(1 - FRICTION)
+            v[1, inward] *= np.float32(-RESTITUTION)
             born = slice(step * births % lanes, step * births % lanes + births)
             x[:, born], v[:, born] = x0[:, born], rng.normal(0, 3, (3, births))
         return x
@@ -92,7 +92,7 @@ def with_numpy(lanes: int, steps: int) -> Callable:
 
 def with_warp(lanes: int, steps: int) -> Iterator[tuple[str, Callable]]:
     """Warp, a launch a step; the random numbers of a birth from its slot and step."""
-    wp = harness.optional("warp", "warp-lang")
+    wp = harness.import_optional("warp", "warp-lang")
     wp.config.quiet = True
     device, births = "cpu", lanes // 500
 
@@ -129,11 +129,11 @@ def with_warp(lanes: int, steps: int) -> Iterator[tuple[str, Callable]]:
 
 def main() -> None:
     """Run all, print the table and the bars, write the record."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
-    tell("a million")
-    jax.block_until_ready(spray(size.many, True, warm=10)(10))
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
+    print_progress("a million")
+    jax.block_until_ready(build_run(size.many, True, warm=10)(10))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
     runs, missing, ours = {}, {}, {}
@@ -145,7 +145,7 @@ def main() -> None:
         about_it = f"{method.__name__}, {response.__name__}"
         ours[about_it] = [f"physjax {about_it}, {what}" for what in ("births and deaths", "neither")]
         for name, emits in zip(ours[about_it], (True, False), strict=True):
-            run = spray(size.lanes, emits, method, response)
+            run = build_run(size.lanes, emits, method, response)
             runs[name] = lambda run=run: run(size.steps)
     runs["NumPy, semi-implicit"] = with_numpy(size.lanes, size.steps)
     try:
@@ -157,9 +157,9 @@ def main() -> None:
         if not jnp.all(jnp.isfinite(jnp.asarray(found))):
             raise SystemExit(f"{name} is not finite")
 
-    timings, failed = harness.side_by_side(runs, size.repeats, check)
+    timings, failed = harness.time_side_by_side(runs, size.repeats, check)
     work = size.lanes * size.steps / 1e6
-    rows = [harness.row(name, OURS if "physjax" in name else OTHER, work, t) for name, t in timings.items()]
+    rows = [harness.make_row(name, OURS if "physjax" in name else OTHER, work, t) for name, t in timings.items()]
     rate = {name: work / timing.least for name, timing in timings.items()}
     bars = [Bar("memory of a process with a million [MiB]", memory, "<=", 1024)]
     for about_it, (born, plain) in ours.items():
@@ -167,7 +167,7 @@ def main() -> None:
         if "semi" in about_it:
             bars.append(Bar(f"{about_it}: with births, million particle-steps/s", rate[born], ">=", 40.0))
 
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     title, unit = f"{size.lanes:,} particles, {size.steps} steps", "million particle-steps/s"
     harness.print_rates(title, unit, rows, next(iter(ours.values()))[0])
     harness.print_bars(bars, quick)
@@ -182,7 +182,7 @@ def main() -> None:
     record |= {"left_out": missing | failed, "bars": [bar._asdict() | {"met": bar.met} for bar in bars]}
     written, drawn = (harness.result_path(folder, "particles", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
-    harness.bar_chart(drawn, [(title, f"{unit} (logarithmic)", rows)], harness.caption(about))
+    harness.draw_bar_chart(drawn, [(title, f"{unit} (logarithmic)", rows)], harness.format_caption(about))
     print(f"\nwritten: {written}, {drawn}")
 
 

@@ -17,7 +17,7 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, Missing, tell
+from harness import Bar, Missing, print_progress
 
 from physjax import RigidBodies, Scene, forces, inertia, methods, rigid, simulate
 
@@ -25,7 +25,7 @@ OURS, OTHER, _ = harness.COLOURS
 DT = 0.002
 LAWS = {"semi-implicit Euler": (methods.semi_implicit_euler, "Euler"), "RK4": (methods.rk4, "RK4")}
 TIMES_FASTER, COMPILE_SECONDS = 50.0, 2.0
-SAME = {"semi-implicit Euler": 2e-3, "RK4": 2e-5}
+ALLOWED_DIFFERENCE = {"semi-implicit Euler": 2e-3, "RK4": 2e-5}
 """How far the two may be from each other after the run [m and 1]: the Euler methods have errors of their own."""
 
 
@@ -50,7 +50,7 @@ class Boxes(NamedTuple):
     spin: np.ndarray
 
     @classmethod
-    def some(cls, lanes: int) -> "Boxes":
+    def sample(cls, lanes: int) -> "Boxes":
         rng = np.random.default_rng(0)
         q = rng.normal(size=(lanes, 4))
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -58,7 +58,7 @@ class Boxes(NamedTuple):
         return cls(*(a.astype(np.float32) for a in numbers))
 
 
-def our_scene(boxes: Boxes) -> Scene:
+def build_scene(boxes: Boxes) -> Scene:
     """The boxes, as a scene of ours; MuJoCo's z is up."""
     body = inertia.box(1.0, boxes.sides)
     zeros = np.zeros_like(boxes.velocity)
@@ -66,14 +66,14 @@ def our_scene(boxes: Boxes) -> Scene:
     return Scene(state, body, (forces.Gravity(9.8, up=2),))
 
 
-def our_run(scene: Scene, method: Callable, steps: int) -> RigidBodies:
+def run_physjax(scene: Scene, method: Callable, steps: int) -> RigidBodies:
     """The boxes after so many steps."""
     return simulate(scene, method, dt=DT, steps=steps, save_every=steps).final_scene.state
 
 
-def mjx_run(boxes: Boxes, integrator: str, steps: int) -> Callable:
+def build_mjx_run(boxes: Boxes, integrator: str, steps: int) -> Callable:
     """A function that steps the boxes in MJX so many times and returns positions and orientations."""
-    mujoco, mjx = harness.optional("mujoco"), harness.optional("mujoco.mjx", "mujoco-mjx")
+    mujoco, mjx = harness.import_optional("mujoco"), harness.import_optional("mujoco.mjx", "mujoco-mjx")
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><option timestep="{DT}" integrator="{integrator}" gravity="0 0 -9.8">'
         '<flag contact="disable" constraint="disable"/></option><worldbody><body><freejoint/>'
@@ -94,44 +94,44 @@ def mjx_run(boxes: Boxes, integrator: str, steps: int) -> Callable:
     return partial(run, *map(jnp.asarray, (moments, boxes.orientation, boxes.velocity, boxes.spin)))
 
 
-def check(scene: Scene, method: Callable, law: str, qpos: Any, steps: int) -> float:
+def check_agreement(scene: Scene, method: Callable, law: str, qpos: Any, steps: int) -> float:
     """The largest difference between ours and MJX's boxes after its steps; SystemExit if it is more than it may be."""
-    state = our_run(scene, method, steps)
+    state = run_physjax(scene, method, steps)
     apart = np.abs(np.asarray(qpos[:, :3]) - state.position).max()
     sign = np.sign(np.sum(np.asarray(qpos[:, 3:]) * state.orientation, axis=-1, keepdims=True))
     apart = max(apart, np.abs(sign * np.asarray(qpos[:, 3:]) - state.orientation).max())
-    if not apart <= SAME[law]:
+    if not apart <= ALLOWED_DIFFERENCE[law]:
         raise SystemExit(f"{law}: ours and MJX's boxes are {apart:.3g} apart after {steps} steps")
     return float(apart)
 
 
 def main() -> None:
     """Run both, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
-    boxes = Boxes.some(size.lanes)
-    scene = our_scene(boxes)
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
+    boxes = Boxes.sample(size.lanes)
+    scene = build_scene(boxes)
     studies, bars, panels = [], [], []
     for law, (method, integrator) in LAWS.items():
-        tell(law)
-        contenders = {"physjax": partial(our_run, scene, method, size.steps)}
+        print_progress(law)
+        contenders = {"physjax": partial(run_physjax, scene, method, size.steps)}
         try:
-            contenders["MJX"] = mjx_run(boxes, integrator, size.steps_of_mjx)
+            contenders["MJX"] = build_mjx_run(boxes, integrator, size.steps_of_mjx)
         except Missing as why:
-            tell(f"  MJX: {why}")
+            print_progress(f"  MJX: {why}")
         apart = []
 
         def same(name, found, method=method, law=law, apart=apart):
             if name == "MJX":
-                apart.append(check(scene, method, law, found, size.steps_of_mjx))
+                apart.append(check_agreement(scene, method, law, found, size.steps_of_mjx))
 
-        timings, failed = harness.side_by_side(contenders, size.repeats, check=same)
+        timings, failed = harness.time_side_by_side(contenders, size.repeats, check=same)
         if failed:
             raise SystemExit(f"{law}: {failed}")
         steps = {"physjax": size.steps, "MJX": size.steps_of_mjx}
         rows = [
-            harness.row(name, OURS if name == "physjax" else OTHER, size.lanes * steps[name] / 1e6, timing)
+            harness.make_row(name, OURS if name == "physjax" else OTHER, size.lanes * steps[name] / 1e6, timing)
             for name, timing in timings.items()
         ]
         studies.append({"law": law, "apart": apart, "runs": rows})
@@ -140,7 +140,7 @@ def main() -> None:
         if "MJX" in timings:
             bars.append(Bar(f"{law}: physjax / MJX", rows[0]["rate"] / rows[1]["rate"], ">=", TIMES_FASTER))
 
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     for study in studies:
         harness.print_rates(
             f"{study['law']}, {size.lanes} boxes", "million body-steps a second", study["runs"], "physjax"
@@ -151,7 +151,7 @@ def main() -> None:
     record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
     written, drawn = (harness.result_path(folder, "rigid", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
-    harness.bar_chart(drawn, panels, harness.caption(about))
+    harness.draw_bar_chart(drawn, panels, harness.format_caption(about))
     print(f"\nwritten: {written} and {drawn.name}")
 
 

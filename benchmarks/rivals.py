@@ -18,11 +18,18 @@ from jax import lax
 
 from physjax import Particles, Scene, forces, methods, ode_term, simulate
 
-G, MASS, AREA, DRAG, AIR, DT = 9.8, 0.145, 4.3e-3, 0.35, 1.225, 1 / 128  # a baseball; the step is exact in binary
-K = 0.5 * AIR * DRAG * AREA / MASS
+G, MASS, AREA, DRAG, AIR_DENSITY, DT = (
+    9.8,
+    0.145,
+    4.3e-3,
+    0.35,
+    1.225,
+    1 / 128,
+)  # a baseball; the step is exact in binary
+K = 0.5 * AIR_DENSITY * DRAG * AREA / MASS
 OURS, JAX, OTHER = harness.COLOURS
-SOFT = 0.05
-HOST = "" if jax.default_backend() == "cpu" else " (CPU)"  # said of whoever stays on the CPU when JAX does not
+SOFTENING_LENGTH = 0.05
+HOST_LABEL = "" if jax.default_backend() == "cpu" else " (CPU)"  # said of whoever stays on the CPU when JAX does not
 F = np.float32
 
 
@@ -35,31 +42,33 @@ class Contender(NamedTuple):
     rk4: bool = True
 
 
-def shots(lanes: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_shots(lanes: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities of throws in all directions at 10 to 50 m/s, `(lanes, 3)` in float32."""
     steep, around, speed = np.random.default_rng(2).uniform([[0.1], [0], [10]], [[1.4], [2 * np.pi], [50]], (3, lanes))
     aim = np.stack([np.cos(steep) * np.cos(around), np.sin(steep), np.cos(steep) * np.sin(around)], axis=-1)
     return np.zeros((lanes, 3), F), (speed[:, None] * aim).astype(F)
 
 
-def thrown(lanes: int) -> Scene:
+def build_throws(lanes: int) -> Scene:
     """The throws as a scene with gravity and drag."""
-    drag = forces.QuadraticDrag(area=AREA, coefficient=DRAG, density=AIR)
-    return Scene(Particles(*map(jnp.asarray, shots(lanes))), mass=MASS, forces=(forces.Gravity(g=G), drag))
+    drag = forces.QuadraticDrag(area=AREA, coefficient=DRAG, density=AIR_DENSITY)
+    return Scene(Particles(*map(jnp.asarray, sample_shots(lanes))), mass=MASS, forces=(forces.Gravity(g=G), drag))
 
 
-def flown(scene: Scene, method: Callable, steps: int) -> jax.Array:
+def simulate_final(scene: Scene, method: Callable, steps: int) -> jax.Array:
     """Final positions through the public `simulate`."""
     return simulate(scene, method, dt=DT, steps=steps, save_every=steps).final_scene.state.position
 
 
 def with_physjax(lanes: int, steps: int) -> Iterator[Contender]:
     """Three methods; and rk4 inside a jit of the user's, where XLA fills half of an AVX-512 register."""
-    scene = thrown(lanes)
+    scene = build_throws(lanes)
     for method in (methods.rk4, methods.verlet, methods.semi_implicit_euler):
         cheaper = "" if method is methods.rk4 else f", forces a step: {method.promises.evaluations}"
-        yield Contender(f"physjax {method.__name__}{cheaper}", OURS, partial(flown, scene, method, steps), not cheaper)
-    inner = jax.jit(lambda scene: flown(scene, methods.rk4, steps))
+        yield Contender(
+            f"physjax {method.__name__}{cheaper}", OURS, partial(simulate_final, scene, method, steps), not cheaper
+        )
+    inner = jax.jit(lambda scene: simulate_final(scene, methods.rk4, steps))
     yield Contender("physjax rk4, inside a user's jit", OURS, partial(inner, scene))
 
 
@@ -107,7 +116,7 @@ def with_diffrax(lanes: int, steps: int) -> Iterator[Contender]:
         start = y0, solver.init(term, 0.0, DT, y0, None)
         return lax.scan(body, start, jnp.arange(steps, dtype=F))[0][0].position
 
-    scene, plain = thrown(lanes), ClassicalRK4(scan_kind="lax")
+    scene, plain = build_throws(lanes), ClassicalRK4(scan_kind="lax")
     forward, default = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
     quick, usual = diffrax.ODETerm(by_components), diffrax.ODETerm(by_norm)
     ways = {
@@ -120,7 +129,7 @@ def with_diffrax(lanes: int, steps: int) -> Iterator[Contender]:
         yield Contender(name, JAX, partial(jax.jit(way), scene.state))
 
 
-def numpy_rk4(x: np.ndarray, v: np.ndarray, steps: int) -> np.ndarray:
+def run_numpy_rk4(x: np.ndarray, v: np.ndarray, steps: int) -> np.ndarray:
     """The same formula in NumPy, in the dtype of the state; components first, `(3, lanes)`, or last, `(lanes, 3)`."""
     kind, first = v.dtype.type, len(v) == 3
     x, v, dt, k, two = x.copy(), v.copy(), kind(DT), kind(-K), kind(2)
@@ -146,9 +155,11 @@ def numpy_rk4(x: np.ndarray, v: np.ndarray, steps: int) -> np.ndarray:
 
 def with_numpy(lanes: int, steps: int) -> Iterator[Contender]:
     """NumPy in both layouts; components first suit it better."""
-    x, v = shots(lanes)
-    yield Contender(f"NumPy, arrays (3, lanes){HOST}", OTHER, partial(numpy_rk4, x.T.copy(), v.T.copy(), steps))
-    yield Contender(f"NumPy, arrays (lanes, 3){HOST}", OTHER, partial(numpy_rk4, x, v, steps))
+    x, v = sample_shots(lanes)
+    yield Contender(
+        f"NumPy, arrays (3, lanes){HOST_LABEL}", OTHER, partial(run_numpy_rk4, x.T.copy(), v.T.copy(), steps)
+    )
+    yield Contender(f"NumPy, arrays (lanes, 3){HOST_LABEL}", OTHER, partial(run_numpy_rk4, x, v, steps))
 
 
 C_SOURCE = r"""
@@ -183,25 +194,25 @@ void fly(column x, column y, column z, column u, column v, column w, long n, lon
 """
 
 
-def by_columns(function: Callable, lanes: int, *numbers: Any) -> np.ndarray:
+def run_columns(function: Callable, lanes: int, *numbers: Any) -> np.ndarray:
     """Run a kernel that changes six arrays in place: x, y, z and their velocities."""
-    columns = [column.copy() for array in shots(lanes) for column in array.T]
+    columns = [column.copy() for array in sample_shots(lanes) for column in array.T]
     function(*columns, *numbers)
     return np.stack(columns[:3], axis=-1)
 
 
 def with_c(lanes: int, steps: int) -> Iterator[Contender]:
     """C by hand, one core."""
-    library = harness.c_library(C_SOURCE)
+    library = harness.compile_c(C_SOURCE)
     library.fly.argtypes = [np.ctypeslib.ndpointer(F)] * 6 + [ctypes.c_long] * 2 + [ctypes.c_float] * 3
     library.fly.restype = None
-    name = f"C, {'AVX-512, ' if harness.avx512() else ''}one core{HOST}"
-    yield Contender(name, OTHER, partial(by_columns, library.fly, lanes, lanes, steps, DT, G, K))
+    name = f"C, {'AVX-512, ' if harness.has_avx512() else ''}one core{HOST_LABEL}"
+    yield Contender(name, OTHER, partial(run_columns, library.fly, lanes, lanes, steps, DT, G, K))
 
 
 def with_numba(lanes: int, steps: int) -> Iterator[Contender]:
     """numba, the loops of the C, blocks of lanes over all cores."""
-    numba = harness.optional("numba")
+    numba = harness.import_optional("numba")
     fast = {"fastmath": True, "error_model": "numpy"}
 
     @numba.njit(inline="always", **fast)
@@ -236,13 +247,13 @@ def with_numba(lanes: int, steps: int) -> Iterator[Contender]:
                     V[i] = v1 + dt * mean(b1, b2, b3, b4)
                     W[i] = w1 + dt * mean(c1, c2, c3, c4)
 
-    run = partial(by_columns, fly, lanes, steps, F(DT), F(G), F(K))
-    yield Contender(f"numba, cores: {numba.get_num_threads()}{HOST}", OTHER, run)
+    run = partial(run_columns, fly, lanes, steps, F(DT), F(G), F(K))
+    yield Contender(f"numba, cores: {numba.get_num_threads()}{HOST_LABEL}", OTHER, run)
 
 
 def with_warp(lanes: int, steps: int) -> Iterator[Contender]:
     """Warp, one thread a lane for all its steps in one launch; on the GPU where JAX is."""
-    wp = harness.optional("warp", "warp-lang")
+    wp = harness.import_optional("warp", "warp-lang")
     wp.config.quiet, wp.config.log_level = True, 30  # the older and the newer way to hear warnings only
     gpu = jax.default_backend() == "gpu" and wp.is_cuda_available()
     device = "cuda:0" if gpu else "cpu"
@@ -275,7 +286,7 @@ def with_warp(lanes: int, steps: int) -> Iterator[Contender]:
             q = q + dt / 6.0 * (k1 + 2.0 * (k2 + k3) + pull(q4, g, k))
         y[i] = p
 
-    start = [wp.array(array, dtype=wp.vec3, device=device) for array in shots(lanes)]
+    start = [wp.array(array, dtype=wp.vec3, device=device) for array in sample_shots(lanes)]
     final = wp.zeros(lanes, dtype=wp.vec3, device=device)
 
     def run():
@@ -283,7 +294,7 @@ def with_warp(lanes: int, steps: int) -> Iterator[Contender]:
         wp.synchronize_device(device)
         return final
 
-    yield Contender(f"Warp {wp.config.version}, {'GPU' if gpu else f'one core{HOST}'}", OTHER, run)
+    yield Contender(f"Warp {wp.config.version}, {'GPU' if gpu else f'one core{HOST_LABEL}'}", OTHER, run)
 
 
 # ---- the studies

@@ -25,19 +25,19 @@ import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
-from harness import Bar, tell
+from harness import Bar, print_progress
 from scipy.integrate import solve_ivp
 
 from physjax import Particles, Scene, forces, methods, ode_term, reference, simulate, sweep
 
 STEPS, DT = 400, 0.01
 AREA, DRAG, DENSITY, MASS, G = 4.3e-3, 0.35, 1.225, 0.145, 9.8
-BUDGET = 128 << 20
+BUDGET_BYTES = 128 << 20
 """Memory that the measured sweep may take [bytes]."""
 TOLERANCES = (1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7, 1e-7)
 OURS, OTHER, PLAIN = harness.COLOURS
 FAMILIES = {OURS: "physjax", OTHER: "diffrax", PLAIN: "SciPy"}
-PAPER = 10**8
+PLANNED_LANES = 10**8
 """Lanes that are planned on paper."""
 
 
@@ -53,7 +53,7 @@ class Settings(NamedTuple):
 FULL, QUICK = Settings(1000, 316, 1000, 5), Settings(100, 30, 20, 1)
 
 
-def axes(points: int) -> dict[str, np.ndarray]:
+def build_axes(points: int) -> dict[str, np.ndarray]:
     """Speeds [m/s] and angles [rad]."""
     return {
         "speed": np.linspace(10, 50, points, dtype=np.float32),
@@ -61,42 +61,42 @@ def axes(points: int) -> dict[str, np.ndarray]:
     }
 
 
-def shot(speed: Any, angle: Any) -> Scene:
+def build_shot(speed: Any, angle: Any) -> Scene:
     """Balls thrown from the origin."""
     launch = speed[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     drag = forces.QuadraticDrag(area=AREA, coefficient=DRAG, density=DENSITY)
     return Scene(Particles(jnp.zeros_like(launch), launch), mass=MASS, forces=(forces.Gravity(G), drag))
 
 
-def place(speed: Any, angle: Any) -> jax.Array:
+def fly_to_end(speed: Any, angle: Any) -> jax.Array:
     """Where a ball is after the flight [m]."""
-    flight = simulate(shot(speed, angle), methods.rk4, dt=DT, steps=STEPS, save_every=STEPS)
+    flight = simulate(build_shot(speed, angle), methods.rk4, dt=DT, steps=STEPS, save_every=STEPS)
     return flight.final_scene.state.position
 
 
-def apex(speed: Any, angle: Any) -> jax.Array:
+def find_apex(speed: Any, angle: Any) -> jax.Array:
     """The greatest height [m] of a hundred frames, which all lanes at once could not keep."""
-    flight = simulate(shot(speed, angle), methods.rk4, dt=DT, steps=STEPS, save_every=STEPS // 100)
+    flight = simulate(build_shot(speed, angle), methods.rk4, dt=DT, steps=STEPS, save_every=STEPS // 100)
     return jnp.max(flight.position[:, 1])
 
 
-def swept(points: int, **options: Any) -> np.ndarray:
+def run_sweep(points: int, **options: Any) -> np.ndarray:
     """The places by `sweep`."""
-    return sweep(place, axes(points), progress=False, **options).values.reshape(-1, 2)
+    return sweep(fly_to_end, build_axes(points), progress=False, **options).values.reshape(-1, 2)
 
 
-def into_folder(points: int) -> np.ndarray:
+def sweep_into_folder(points: int) -> np.ndarray:
     """The same into a folder, and read from there."""
     with tempfile.TemporaryDirectory() as folder:
-        return swept(points, out=folder)
+        return run_sweep(points, out=folder)
 
 
-def by_diffrax(speed: jax.Array, angle: jax.Array, tolerance: jax.Array) -> jax.Array:
+def run_diffrax(speed: jax.Array, angle: jax.Array, tolerance: jax.Array) -> jax.Array:
     """The places by diffrax."""
 
     @jax.vmap
     def one(speed, angle):
-        scene = shot(speed, angle)
+        scene = build_shot(speed, angle)
         end = diffrax.diffeqsolve(
             ode_term(scene),
             diffrax.Tsit5(),
@@ -113,7 +113,7 @@ def by_diffrax(speed: jax.Array, angle: jax.Array, tolerance: jax.Array) -> jax.
     return one(speed, angle)
 
 
-def by_scipy(speed: np.ndarray, angle: np.ndarray, tolerance: float) -> np.ndarray:
+def run_scipy(speed: np.ndarray, angle: np.ndarray, tolerance: float) -> np.ndarray:
     """The places by a loop over `solve_ivp`."""
 
     def rate(t, y):
@@ -124,18 +124,18 @@ def by_scipy(speed: np.ndarray, angle: np.ndarray, tolerance: float) -> np.ndarr
     return np.array([solve_ivp(rate, (0, STEPS * DT), y, rtol=tolerance, atol=tolerance).y[:2, -1] for y in starts])
 
 
-def error(found: Any, truth: np.ndarray) -> float:
+def worst_error(found: Any, truth: np.ndarray) -> float:
     """The worst distance from the truth [m]."""
     return float(np.sqrt(((np.asarray(found, float) - truth) ** 2).sum(-1)).max())
 
 
-def matched(fly: Any, truth: np.ndarray, allowed: float) -> tuple[float, float]:
+def match_tolerance(fly: Any, truth: np.ndarray, allowed: float) -> tuple[float, float]:
     """The largest tolerance whose worst error is allowed, or else the one of the least error; and that error [m]."""
-    tried = [(tolerance, error(fly(tolerance), truth)) for tolerance in TOLERANCES]
+    tried = [(tolerance, worst_error(fly(tolerance), truth)) for tolerance in TOLERANCES]
     return next((one for one in tried if one[1] <= allowed), min(tried, key=lambda one: one[1]))
 
 
-def alone(task: str, *, points: int, devices: int, repeats: int) -> list[float]:
+def run_alone(task: str, *, points: int, devices: int, repeats: int) -> list[float]:
     """The numbers of a `--task` in a process of its own."""
     given = {"points": points, "devices": devices, "repeats": repeats}
     command = [sys.executable, __file__, "--task", task, json.dumps(given)]
@@ -143,7 +143,7 @@ def alone(task: str, *, points: int, devices: int, repeats: int) -> list[float]:
     return [float(number) for number in run.stdout.split()]
 
 
-def seconds(points: int, repeats: int) -> tuple[float, ...]:
+def time_devices(points: int, repeats: int) -> tuple[float, ...]:
     """The least times of a sweep on one device on one core, and on two devices on two cores, taken in turn [s]."""
     mine = sorted(os.sched_getaffinity(0))
     cores = [*mine, *(core for core in range(os.cpu_count()) if core not in mine)]
@@ -152,33 +152,33 @@ def seconds(points: int, repeats: int) -> tuple[float, ...]:
         for count, times in taken.items():
             for thread in os.listdir("/proc/self/task"):
                 os.sched_setaffinity(int(thread), cores[:count])
-            times.append(harness.stopwatch(partial(swept, points, devices=jax.local_devices()[:count])))
+            times.append(harness.time_call(partial(run_sweep, points, devices=jax.local_devices()[:count])))
     return tuple(min(times[1:]) for times in taken.values())
 
 
-def memory(points: int, repeats: int) -> tuple[float]:
+def measure_memory(points: int, repeats: int) -> tuple[float]:
     """Memory that a sweep into a folder takes at its highest, its compilation included [bytes]."""
     with tempfile.TemporaryDirectory() as folder:
-        sweep(place, axes(10), progress=False, out=Path(folder) / "first")  # what any sweep loads
+        sweep(fly_to_end, build_axes(10), progress=False, out=Path(folder) / "first")  # what any sweep loads
         Path("/proc/self/clear_refs").write_text("5")  # forget the highest so far
-        before = _status("VmRSS")
-        sweep(apex, axes(points), progress=False, memory=BUDGET, out=Path(folder) / "measured")
-        return (_status("VmHWM") - before,)
+        before = _read_status("VmRSS")
+        sweep(find_apex, build_axes(points), progress=False, memory=BUDGET_BYTES, out=Path(folder) / "measured")
+        return (_read_status("VmHWM") - before,)
 
 
-def _status(field: str) -> float:
+def _read_status(field: str) -> float:
     line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(field))
     return 1024 * float(line.split()[1])
 
 
-def spoilt_bits(points: int) -> int:
+def count_changed_lanes(points: int) -> int:
     """Good lanes of a sweep with 1 % of NaN whose bits differ from those of the clean sweep."""
-    grid = np.stack([a.ravel() for a in np.meshgrid(*axes(points).values(), indexing="ij")])
+    grid = np.stack([a.ravel() for a in np.meshgrid(*build_axes(points).values(), indexing="ij")])
     lanes = grid.shape[1]
     bad = np.random.default_rng(0).choice(lanes, lanes // 100, replace=False)
     dirty = grid.copy()
     dirty[0, bad] = np.nan
-    clean, other = (sweep(place, {"speed": s, "angle": a}, design="zip", progress=False) for s, a in (grid, dirty))
+    clean, other = (sweep(fly_to_end, {"speed": s, "angle": a}, design="zip", progress=False) for s, a in (grid, dirty))
     if np.count_nonzero(~other.ok) != bad.size:
         raise SystemExit(f"{np.count_nonzero(~other.ok)} lanes are said to be bad, expected {bad.size}.")
     return int(np.any(clean.values != other.values, axis=-1)[other.ok].sum())
@@ -186,51 +186,53 @@ def spoilt_bits(points: int) -> int:
 
 def main() -> None:
     """Run all contenders, print their tables, write the record and the chart."""
-    quick, folder = harness.options(__doc__)
-    size, about = QUICK if quick else FULL, harness.machine()
-    tell(harness.caption(about))
+    quick, folder = harness.parse_options(__doc__)
+    size, about = QUICK if quick else FULL, harness.describe_machine()
+    print_progress(harness.format_caption(about))
     lanes, rivals = size.points**2, size.rival_points**2
-    speed, angle = (a.ravel() for a in np.meshgrid(*axes(size.points).values(), indexing="ij"))
+    speed, angle = (a.ravel() for a in np.meshgrid(*build_axes(size.points).values(), indexing="ij"))
     some = np.linspace(0, lanes - 1, size.few).astype(int)
     fleet = jnp.asarray(speed), jnp.asarray(angle)
     part = jnp.asarray(speed[:: lanes // rivals][:rivals]), jnp.asarray(angle[:: lanes // rivals][:rivals])
     with jax.enable_x64(True):
-        truth = reference(shot(jnp.asarray(speed[some], float), jnp.asarray(angle[some], float)), [0.0, STEPS * DT])
+        truth = reference(
+            build_shot(jnp.asarray(speed[some], float), jnp.asarray(angle[some], float)), [0.0, STEPS * DT]
+        )
     truth = np.asarray(truth.position[-1])
-    with harness.compilations() as seen:
-        ours = error(swept(size.points)[some], truth)
+    with harness.record_compilations() as seen:
+        ours = worst_error(run_sweep(size.points)[some], truth)
     compiled = len(seen)
-    fly = jax.jit(by_diffrax)
+    fly = jax.jit(run_diffrax)
     tolerance = {
-        OTHER: matched(partial(fly, *(a[some] for a in fleet)), truth, ours),
-        PLAIN: matched(partial(by_scipy, speed[some], angle[some]), truth, ours),
+        OTHER: match_tolerance(partial(fly, *(a[some] for a in fleet)), truth, ours),
+        PLAIN: match_tolerance(partial(run_scipy, speed[some], angle[some]), truth, ours),
     }
     runs = {
-        "simulate, one scene of all lanes": partial(place, *fleet),
-        "sweep": partial(swept, size.points),
-        "sweep into a folder": partial(into_folder, size.points),
+        "simulate, one scene of all lanes": partial(fly_to_end, *fleet),
+        "sweep": partial(run_sweep, size.points),
+        "sweep into a folder": partial(sweep_into_folder, size.points),
         f"diffrax Tsit5, vmapped, {rivals:,} lanes": partial(fly, *part, tolerance[OTHER][0]),
-        f"SciPy solve_ivp, a loop, {size.few} lanes": partial(by_scipy, speed[some], angle[some], tolerance[PLAIN][0]),
+        f"SciPy solve_ivp, a loop, {size.few} lanes": partial(run_scipy, speed[some], angle[some], tolerance[PLAIN][0]),
     }
-    timings, failed = harness.side_by_side(runs, size.repeats)
+    timings, failed = harness.time_side_by_side(runs, size.repeats)
     if failed:
         raise SystemExit(f"{failed}")
     counts, families = (lanes, lanes, lanes, rivals, size.few), (OURS, OURS, OURS, OTHER, PLAIN)
     rows = [
-        harness.row(name, family, count, timing)
+        harness.make_row(name, family, count, timing)
         for count, family, (name, timing) in zip(counts, families, timings.items(), strict=True)
     ]
     bare, rate, kept = (row["rate"] for row in rows[:3])
-    tell("memory, two devices")
-    (taken,) = alone("memory", points=size.points, devices=1, repeats=1)
-    one, two = alone("seconds", points=size.points, devices=2, repeats=4 * size.repeats)
+    print_progress("memory, two devices")
+    (taken,) = run_alone("memory", points=size.points, devices=1, repeats=1)
+    one, two = run_alone("seconds", points=size.points, devices=2, repeats=4 * size.repeats)
     bars = [
         Bar("sweep: share of the rate of the bare run", rate / bare, ">=", 0.7),
         Bar("sweep into a folder: share of the rate of the bare run", kept / bare, ">=", 0.7),
         Bar("sweep: compilations", compiled, "<=", 1),
-        Bar("memory taken, in parts of the budget", taken / BUDGET, "<=", 1.0),
+        Bar("memory taken, in parts of the budget", taken / BUDGET_BYTES, "<=", 1.0),
         Bar("two devices on two cores: times faster than one on one", one / two, ">=", 1.6),
-        Bar("lanes changed by 1 % of NaN lanes", spoilt_bits(size.points), "<=", 0),
+        Bar("lanes changed by 1 % of NaN lanes", count_changed_lanes(size.points), "<=", 0),
         Bar("sweep: times faster than diffrax at equal error", rate / rows[3]["rate"], ">=", 1.0),
         Bar("sweep: times faster than SciPy at equal error", rate / rows[4]["rate"], ">=", 1.0),
     ]
@@ -241,24 +243,32 @@ def main() -> None:
     ]
     batch = 1 << 17
     paper = {
-        "chunks": -(-PAPER // batch),
-        "disk_bytes": PAPER * 10,
-        "hours_on_one_core": PAPER / kept / 3600,
-        "solve_ivp_days": PAPER / rows[4]["rate"] / 86400,
+        "chunks": -(-PLANNED_LANES // batch),
+        "disk_bytes": PLANNED_LANES * 10,
+        "hours_on_one_core": PLANNED_LANES / kept / 3600,
+        "solve_ivp_days": PLANNED_LANES / rows[4]["rate"] / 86400,
     }
-    print(harness.caption(about))
+    print(harness.format_caption(about))
     harness.print_rates(f"{lanes:,} shots of {STEPS} steps", "lanes a second", rows, "sweep")
     harness.print_table("Equal error", ["", "tolerance", "worst error [m]"], accuracy)
-    harness.print_table(f"{PAPER:,} lanes on paper", list(paper), [[f"{n:.4g}" for n in paper.values()]])
+    harness.print_table(f"{PLANNED_LANES:,} lanes on paper", list(paper), [[f"{n:.4g}" for n in paper.values()]])
     harness.print_bars(bars, quick)
     record = {"benchmark": "sweep", "quick": quick, "machine": about, "settings": size._asdict(), "runs": rows}
     record["accuracy"] = accuracy
-    record |= {"one_device_s": one, "two_devices_s": two, "memory_bytes": taken, "budget_bytes": BUDGET, "paper": paper}
+    record |= {
+        "one_device_s": one,
+        "two_devices_s": two,
+        "memory_bytes": taken,
+        "budget_bytes": BUDGET_BYTES,
+        "paper": paper,
+    }
     record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
     written, drawn = (harness.result_path(folder, "sweep", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
     title = f"{lanes:,} shots with quadratic drag, {STEPS} steps of rk4, float32; rivals at equal error"
-    harness.bar_chart(drawn, [(title, "lanes per second (logarithmic)", rows)], harness.caption(about), FAMILIES)
+    harness.draw_bar_chart(
+        drawn, [(title, "lanes per second (logarithmic)", rows)], harness.format_caption(about), FAMILIES
+    )
     print(f"\nwritten: {written} and {drawn.name}")
 
 
@@ -266,6 +276,6 @@ if __name__ == "__main__":
     if "--task" in sys.argv:
         given = json.loads(sys.argv[3])
         jax.config.update("jax_num_cpu_devices", given.pop("devices"))
-        print(*{"seconds": seconds, "memory": memory}[sys.argv[2]](**given))
+        print(*{"seconds": time_devices, "memory": measure_memory}[sys.argv[2]](**given))
     else:
         main()

@@ -15,11 +15,11 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
-FEWEST = 1024
+MIN_LANES_TO_SELECT = 1024
 """Scenes with fewer lanes are not worth picking lanes from."""
-SHARE = 32
+GROUPS_PER_SCENE = 32
 """One lane in so many is room enough for the lanes that are picked at once."""
-WHOLE = 64
+SINGLE_PIECE_NODES = 64
 """Scenes with no more coupled nodes are compiled as one piece, which for few nodes runs faster."""
 
 
@@ -34,7 +34,7 @@ def _any_lane_of_a_batch(axis_size, batched, flag):
     return any_lane(jnp.any(flag, axis=0)), False
 
 
-def apart(flag: Bool[Array, "..."], function: Callable, like: Any = None) -> Any:
+def materialise_where(flag: Bool[Array, "..."], function: Callable, like: Any = None) -> Any:
     """`function()`, kept apart from what reads it: XLA on CPU would compute it again in each of its many readers.
 
     Where no lane is flagged it may be `like` instead (zeros by default); the compiler cannot know whether there is one.
@@ -44,14 +44,14 @@ def apart(flag: Bool[Array, "..."], function: Callable, like: Any = None) -> Any
     return lax.cond(any_lane(flag), function, lambda: like)
 
 
-def kept_apart(t: ArrayLike, function: Callable) -> Any:
+def materialise(t: ArrayLike, function: Callable) -> Any:
     """`function()`, kept apart from what reads it at any finite time t; on CPU by a branch that the compiler must believe in."""
     if jax.default_backend() == "cpu":
-        return apart(jnp.isfinite(t), function)
+        return materialise_where(jnp.isfinite(t), function)
     return lax.optimization_barrier(function())
 
 
-def on_flagged(
+def compact_and_apply(
     function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *others: Any, masks: Any, cut: bool
 ) -> Any:
     """`function(changing, *others)`, computed only if a lane is flagged; it must leave the other lanes as they are.
@@ -61,15 +61,15 @@ def on_flagged(
     reverse mode goes through.
     """
     lanes, total = flag.shape, flag.size
-    if not cut or total < FEWEST:
+    if not cut or total < MIN_LANES_TO_SELECT:
         return lax.cond(any_lane(flag), lambda: function(changing, *others), lambda: changing)
-    size = math.ceil(total / SHARE)
+    size = math.ceil(total / GROUPS_PER_SCENE)
     by_lane = lambda leaf: leaf.reshape((total, *leaf.shape[len(lanes) :]))  # noqa: E731
     flat = jax.tree.map(by_lane, changing)
-    words, upto = _census(flag.ravel())
+    words, upto = _pack_flags(flag.ravel())
 
     def group(now, first):
-        index = _picked(words, upto, first + jnp.arange(size, dtype=jnp.int32))
+        index = _find_flagged_lanes(words, upto, first + jnp.arange(size, dtype=jnp.int32))
         pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
         few = jax.tree.map(lambda a, has_lanes: pick(by_lane(a)) if has_lanes else a, others, masks)
         done = function(jax.tree.map(pick, now), *few)
@@ -89,17 +89,17 @@ def on_flagged(
     return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
 
 
-def on_runs(function: Callable, flagged: Callable, changing: Any, *others: Any) -> Any:
+def compact_and_apply_runs(function: Callable, flagged: Callable, changing: Any, *others: Any) -> Any:
     """`function(changing, *others)`, computed only where `flagged(changing, *others)`, for flags that stand side by side.
 
     `changing` and what comes back are trees of arrays along one axis of lanes; the function must leave other lanes as they
     are, and do away with the flag of those it is for. Windows slide to the next flagged lane until there is none: a
-    slice is copied where the lanes picked by `on_flagged` would be gathered and scattered. Reverse mode goes through.
+    slice is copied where the lanes picked by `compact_and_apply` would be gathered and scattered. Reverse mode goes through.
     """
     total = len(jax.tree.leaves(changing)[0])
-    if total < FEWEST:
+    if total < MIN_LANES_TO_SELECT:
         return lax.cond(any_lane(flagged(changing, *others)), lambda: function(changing, *others), lambda: changing)
-    size = math.ceil(total / SHARE)
+    size = math.ceil(total / GROUPS_PER_SCENE)
 
     def window(now):
         first = jnp.minimum(jnp.argmax(flagged(now, *others)).astype(jnp.int32), total - size)
@@ -112,11 +112,11 @@ def on_runs(function: Callable, flagged: Callable, changing: Any, *others: Any) 
 
     once = partial(where_left, window)
     # the last window is moved back to fit, and so may be one more for lanes that come round to the first
-    rest = lambda now: lax.scan(lambda now, _: (once(now), None), now, length=SHARE)[0]  # noqa: E731
+    rest = lambda now: lax.scan(lambda now, _: (once(now), None), now, length=GROUPS_PER_SCENE)[0]  # noqa: E731
     return where_left(rest, once(changing))
 
 
-def _census(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
+def _pack_flags(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
     """The flags as words of 32 bits, and how many are set up to and in each word: bit b of word w is lane b·words + w."""
     length = math.ceil(flag.size / 32)
     bits = jnp.pad(flag, (0, 32 * length - flag.size)).reshape(32, length).astype(jnp.uint32)
@@ -126,7 +126,7 @@ def _census(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
     return words, jnp.cumsum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
 
 
-def _picked(words: Array, upto: Array, number: Array) -> Array:
+def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
     """The lanes of the flags with these numbers, counted from zero; the number of lanes or more where there are not so many."""
     word = jnp.searchsorted(upto, number + 1, method="scan_unrolled").astype(jnp.int32)
     left = words.at[word].get(mode="clip")
@@ -141,9 +141,9 @@ def _picked(words: Array, upto: Array, number: Array) -> Array:
     return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
 
 
-def loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
+def bounded_while_loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
     """`lax.while_loop(going, body, start)`, at most so many times, which compiles in pieces where the lanes are few."""
-    few = jax.default_backend() == "cpu" and max(leaf.size for leaf in jax.tree.leaves(start)) < FEWEST
+    few = jax.default_backend() == "cpu" and max(leaf.size for leaf in jax.tree.leaves(start)) < MIN_LANES_TO_SELECT
 
     def again(state):
         return going(state[0]) & (state[1][0] < most)
@@ -156,7 +156,7 @@ def loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
 
 
 @partial(jax.checkpoint, prevent_cse=False)  # so that reverse mode has a sort in its loop as well
-def in_pieces(array: Array, number: Array) -> Array:
+def split_compilation(array: Array, number: Array) -> Array:
     """The array as it is; a loop over `number` that has this in its body is compiled in pieces.
 
     XLA on CPU makes one function of a small loop and of everything in it. Few lines run faster so; many, such as the

@@ -16,14 +16,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 
-def concrete(value: Any) -> np.ndarray | None:
+def concrete_or_none(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is being traced."""
     if isinstance(value, jax.core.Tracer):
         return None
     return np.asarray(jax.device_get(value) if isinstance(value, jax.Array) else value)
 
 
-def real_array(name: str, value: Any) -> Array:
+def as_real_array(name: str, value: Any) -> Array:
     """`value` as a floating-point array; Python numbers stay weakly typed, integers become floats, else a TypeError."""
     with jax.transfer_guard_host_to_device("allow"):  # what a call is given goes to the device on purpose
         if isinstance(value, int | float) and not isinstance(value, bool):
@@ -31,7 +31,9 @@ def real_array(name: str, value: Any) -> Array:
         try:
             array = jnp.asarray(value)
         except (TypeError, ValueError) as error:
-            raise TypeError(f"{name}: got {_shown(value)}, expected real numbers or an array of them.") from error
+            raise TypeError(
+                f"{name}: got {_describe_value(value)}, expected real numbers or an array of them."
+            ) from error
     if jnp.issubdtype(array.dtype, jnp.integer):
         return array.astype(jnp.result_type(float))
     if not jnp.issubdtype(array.dtype, jnp.floating):
@@ -41,7 +43,7 @@ def real_array(name: str, value: Any) -> Array:
     return array
 
 
-def demand(name: str, array: Array, good: ArrayLike, expected: str) -> None:
+def demand_all(name: str, array: Array, good: ArrayLike, expected: str) -> None:
     """Raise a ValueError naming the first offending entry unless all of `good` holds."""
     if np.all(good):
         return
@@ -56,7 +58,7 @@ def demand(name: str, array: Array, good: ArrayLike, expected: str) -> None:
     )
 
 
-def real_quantity(
+def as_real_quantity(
     name: str,
     value: Any,
     *,
@@ -65,33 +67,33 @@ def real_quantity(
     at_most: int | float | None = None,
 ) -> Array:
     """A finite real array, optionally bounded from below (`above`: strictly) and from above."""
-    array = real_array(name, value)
-    values = concrete(array)
+    array = as_real_array(name, value)
+    values = concrete_or_none(array)
     if values is None:
         return array
-    demand(name, array, np.isfinite(values), "finite numbers (no NaN or infinity)")
+    demand_all(name, array, np.isfinite(values), "finite numbers (no NaN or infinity)")
     if above is not None:
-        demand(name, array, values > above, f"numbers > {above:g}")
+        demand_all(name, array, values > above, f"numbers > {above:g}")
     if at_least is not None and at_most is not None:
-        demand(name, array, (values >= at_least) & (values <= at_most), f"numbers from {at_least:g} to {at_most:g}")
+        demand_all(name, array, (values >= at_least) & (values <= at_most), f"numbers from {at_least:g} to {at_most:g}")
     elif at_least is not None:
-        demand(name, array, values >= at_least, f"numbers >= {at_least:g}")
+        demand_all(name, array, values >= at_least, f"numbers >= {at_least:g}")
     elif at_most is not None:
-        demand(name, array, values <= at_most, f"numbers <= {at_most:g}")
+        demand_all(name, array, values <= at_most, f"numbers <= {at_most:g}")
     return array
 
 
 def demand_direction(name: str, vector: Array) -> None:
     """Raise a ValueError for a zero vector, which has none."""
-    values = concrete(vector)
+    values = concrete_or_none(vector)
     if values is not None:
-        demand(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
+        demand_all(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
 
 
-VECTORS = ("vector", "place")
+VECTOR_KINDS = ("vector", "place")
 """Kinds with one component for each dimension of space."""
-KINDS = ("number", *VECTORS, "axial", "rotation", "tensor")
-OWN_AXES = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, "memory": 0, None: 0}
+KINDS = ("number", *VECTOR_KINDS, "axial", "rotation", "tensor")
+ENTRY_AXIS_COUNT = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, "memory": 0, None: 0}
 """Axes that a quantity has behind those of the lanes and before those of its kind."""
 
 
@@ -114,7 +116,7 @@ class Quantity(NamedTuple):
 
     def axes(self, dim: int) -> tuple[int, ...]:
         """The axes of its kind, in a space of `dim` dimensions."""
-        if self.kind in VECTORS:
+        if self.kind in VECTOR_KINDS:
             return (dim,)
         if self.kind == "tensor":
             return (dim, dim)
@@ -166,12 +168,12 @@ def quantity(
     def convert(value):
         if value is None and optional:
             return None
-        return real_quantity(f"{name} [{unit}]", value, **bounds)
+        return as_real_quantity(f"{name} [{unit}]", value, **bounds)
 
-    return eqx.field(converter=convert, metadata=_declared(Quantity(name, unit, kind, per, **bounds)), **options)
+    return eqx.field(converter=convert, metadata=_build_metadata(Quantity(name, unit, kind, per, **bounds)), **options)
 
 
-def declared(
+def unchecked_quantity(
     name: str,
     unit: str = "1",
     *,
@@ -182,32 +184,32 @@ def declared(
     **options: Any,
 ) -> Any:
     """A field that is declared as `quantity` declares it, and neither converted nor checked when the module is built."""
-    return eqx.field(metadata=_declared(Quantity(name, unit, kind, per, above, at_least)), **options)
+    return eqx.field(metadata=_build_metadata(Quantity(name, unit, kind, per, above, at_least)), **options)
 
 
-def _declared(quantity: Quantity) -> dict[str, Any]:
-    if quantity.kind not in KINDS or quantity.per not in OWN_AXES:
+def _build_metadata(quantity: Quantity) -> dict[str, Any]:
+    if quantity.kind not in KINDS or quantity.per not in ENTRY_AXIS_COUNT:
         raise ValueError(
             f"{quantity.name}: got kind={quantity.kind!r} and per={quantity.per!r}, expected a kind of {KINDS} and "
-            f"per one of {tuple(OWN_AXES)}."
+            f"per one of {tuple(ENTRY_AXIS_COUNT)}."
         )
     return {"unit": quantity.unit, "quantity": quantity}
 
 
-def positive_integer(name: str, value: Any, *, at_least: int = 1) -> int:
+def as_positive_integer(name: str, value: Any, *, at_least: int = 1) -> int:
     """A Python int of at least `at_least`; a count is part of the program's shape and cannot be traced."""
     if isinstance(value, jax.core.Tracer):
         raise TypeError(
             f"{name}: got a traced value, expected a Python int: counts are shape. Pass it as a static argument."
         )
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{name}: got {_shown(value)}, expected an integer.")
+        raise TypeError(f"{name}: got {_describe_value(value)}, expected an integer.")
     if value < at_least:
         raise ValueError(f"{name}: got {value}, expected at least {at_least}.")
     return int(value)
 
 
-def known(kind: str, name: str, names: Iterable[str]) -> str:
+def demand_known(kind: str, name: str, names: Iterable[str]) -> str:
     """`name` if it is one of `names`; otherwise a ValueError with the nearest ones."""
     names = sorted(names)
     if name in names:
@@ -217,27 +219,31 @@ def known(kind: str, name: str, names: Iterable[str]) -> str:
     raise ValueError(f"unknown {kind} {name!r}. {hint}")
 
 
-def _shown(value: Any) -> str:
+def _describe_value(value: Any) -> str:
     text = repr(value)
     return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
 
 
-def starts_legally(contact: Any, state: Any) -> Array:
+def starts_outside(contact: Any, state: Any) -> Array:
     """Which lanes start on the right side of a contact, but for rounding."""
-    gap = contact.clearance(jnp.zeros((), state.dtype), state)
+    signed_distance = contact.clearance(jnp.zeros((), state.dtype), state)
     position = jnp.where(jnp.isfinite(state.position), jnp.abs(state.position), 0.0)
-    return gap >= -8 * float(jnp.finfo(state.dtype).eps) * jnp.max(position)
+    return signed_distance >= -8 * float(jnp.finfo(state.dtype).eps) * jnp.max(position)
 
 
-def demand_legal(contact: Any, state: Any) -> None:
+def demand_start_outside(contact: Any, state: Any) -> None:
     """Raise a ValueError naming the lanes that start on the wrong side of a contact by more than rounding."""
-    legal = concrete(starts_legally(contact, state))
+    legal = concrete_or_none(starts_outside(contact, state))
     if legal is None or legal.all():
         return
-    gap = np.asarray(contact.clearance(jnp.zeros((), state.dtype), state))
+    signed_distance = np.asarray(contact.clearance(jnp.zeros((), state.dtype), state))
     lanes = np.argwhere(~legal)
-    where = "it starts" if not gap.ndim else f"{len(lanes)} of {gap.size} lanes start, first {lanes[0].tolist()},"
+    where = (
+        "it starts"
+        if not signed_distance.ndim
+        else f"{len(lanes)} of {signed_distance.size} lanes start, first {lanes[0].tolist()},"
+    )
     raise ValueError(
-        f"{type(contact).__name__}: {where} on the wrong side, {-gap.min():.3g} m deep; expected gaps >= 0. "
+        f"{type(contact).__name__}: {where} on the wrong side, {-signed_distance.min():.3g} m deep; expected gaps >= 0. "
         "Move them, or put them on the surface: state = contact.respond(0.0, state)."
     )

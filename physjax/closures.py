@@ -16,31 +16,31 @@ from weakref import WeakKeyDictionary
 import jax
 import jax.numpy as jnp
 
-WRAPPERS = {"physjax", "contextlib", "equinox", "jaxtyping", "beartype"}
+WRAPPER_PACKAGES = {"physjax", "contextlib", "equinox", "jaxtyping", "beartype"}
 """Whose frames stand between a user's call and the place where it is judged."""
-_latest: WeakKeyDictionary[CodeType, Callable] = WeakKeyDictionary()
+_last_compiled: WeakKeyDictionary[CodeType, Callable] = WeakKeyDictionary()
 """The function that was last compiled of each piece of code."""
-_told: WeakKeyDictionary[CodeType, bool] = WeakKeyDictionary()
+_warned_codes: WeakKeyDictionary[CodeType, bool] = WeakKeyDictionary()
 """The code whose user knows."""
 
 
-def warn_of_remade(who: str, functions: Iterable[Any]) -> None:
+def warn_of_recompilation(who: str, functions: Iterable[Any]) -> None:
     """Warn, once for each, of a user's function whose code was compiled before as another function.
 
     Only where the call itself compiles: not inside of a user's `jit`, which is compiled once, nor under `disable_jit`.
     """
-    found = [(function, code) for function in functions if (code := _code_of(function)) is not None]
+    found = [(function, code) for function in functions if (code := _find_code(function)) is not None]
     if not found or jax.config.jax_disable_jit or isinstance(jnp.zeros(()), jax.core.Tracer):
         return
     for function, code in found:
-        before = _latest.get(code, function)
-        _latest[code] = function
-        if before != function and code not in _told:
-            _told[code] = True
-            _tell_user(_words(who, code))
+        before = _last_compiled.get(code, function)
+        _last_compiled[code] = function
+        if before != function and code not in _warned_codes:
+            _warned_codes[code] = True
+            _warn_user(_format_warning(who, code))
 
 
-def _words(who: str, code: CodeType) -> str:
+def _format_warning(who: str, code: CodeType) -> str:
     return (
         f"{who}: the function {code.co_name} ({code.co_filename}:{code.co_firstlineno}) is not the one of the call before, "
         "though its code is the same: it is defined anew at each call, and each time the whole run is compiled anew, "
@@ -50,15 +50,15 @@ def _words(who: str, code: CodeType) -> str:
     )
 
 
-def _tell_user(words: str) -> None:
+def _warn_user(words: str) -> None:
     """Warn at the line of the user's own that led here, past ours and what wraps it."""
     frame, depth = sys._getframe(), 1
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WRAPPERS:
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WRAPPER_PACKAGES:
         frame, depth = frame.f_back, depth + 1
     warnings.warn(words, stacklevel=depth)
 
 
-def _code_of(function: Any) -> CodeType | None:
+def _find_code(function: Any) -> CodeType | None:
     """The code of a user's function, however it is wrapped; None of the library's own, and of what is not made of code."""
     while isinstance(function, partial):
         function = function.func

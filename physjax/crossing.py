@@ -18,14 +18,14 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.backend import any_lane
 from physjax.checks import quantity
-from physjax.closures import warn_of_remade
-from physjax.loops import Moment, moment_at, now, repeat
-from physjax.particles import demand_particles, wide
+from physjax.closures import warn_of_recompilation
+from physjax.loops import Moment, moment_at, repeat_steps, to_float_time
+from physjax.particles import append_axes, demand_particles
 from physjax.parts import as_module
-from physjax.roots import first_root
+from physjax.roots import find_first_root
 from physjax.vectors import norm
 
-TOGETHER = 64
+NODES_PER_BATCH = 64
 """Nodes of a coupled scene whose crossings are sought at once, each with a copy of the scene."""
 
 
@@ -44,50 +44,50 @@ class Height(eqx.Module):
     height: Float[Array, "..."] = quantity("height", "m")
     up: int = eqx.field(static=True, default=1)
 
-    def gap(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """How far above [m]."""
         return position[..., self.up] - self.height.astype(position.dtype)
 
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
-def first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
+def find_first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
     demand_particles("crossing", run.scene.state, "of bodies record the gap instead")
     if direction not in (None, 1, -1):
         raise ValueError(
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
         )
-    if not hasattr(surface, "gap"):
-        warn_of_remade("crossing", [surface])
+    if not hasattr(surface, "signed_distance"):
+        warn_of_recompilation("crossing", [surface])
         surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
-    return _crossing(run, surface, jnp.asarray(direction or 0, jnp.int32))
+    return _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
 @eqx.filter_jit
-def _crossing(run: Any, surface: Any, way: Array) -> Crossing:
-    find = lambda run: _crossing_of_one(run, surface, way)  # noqa: E731
+def _find_crossings(run: Any, surface: Any, way: Array) -> Crossing:
+    find = lambda run: _find_run_crossings(run, surface, way)  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
         find = jax.vmap(find)
     return find(run)
 
 
-def _crossing_of_one(run: Any, surface: Any, way: Array) -> Crossing:
-    scene, gap = run.scene, _checked_gap(surface, run.scene)
+def _find_run_crossings(run: Any, surface: Any, way: Array) -> Crossing:
+    scene, signed_distance = run.scene, _get_distance_function(surface, run.scene)
     if not (scene.couples and scene.state.lanes):  # one ball is tied to nobody, whatever its forces say
-        return _unit_crossing(run, gap, way, lambda leaf: leaf)
+        return _find_unit_crossings(run, signed_distance, way, lambda leaf: leaf)
 
     def of_node(n):
-        return _unit_crossing(run, lambda t, x: gap(t, x)[..., n], way, lambda leaf: leaf[..., n, :])
+        return _find_unit_crossings(run, lambda t, x: signed_distance(t, x)[..., n], way, lambda leaf: leaf[..., n, :])
 
     # a node's moment is its own, and the whole scene is stepped to it
     count = scene.state.lanes[-1]
     nodes = jnp.arange(count, dtype=jnp.int32)
-    few = count <= TOGETHER
-    found = jax.vmap(of_node)(nodes) if few else lax.map(jax.checkpoint(of_node), nodes, batch_size=TOGETHER)
+    few = count <= NODES_PER_BATCH
+    found = jax.vmap(of_node)(nodes) if few else lax.map(jax.checkpoint(of_node), nodes, batch_size=NODES_PER_BATCH)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(scene.status_shape)), found)
 
 
-class _Place(NamedTuple):
+class _CrossingStep(NamedTuple):
     """Where a crossing was found: in the step that begins so many steps after a frame; the gaps at both its ends."""
 
     frame: Array
@@ -105,83 +105,90 @@ class _Replay(NamedTuple):
 
     frames: Any
     step: Callable
-    gap: Callable
+    signed_distance: Callable
     first_step: Array
-    every: int
+    steps_per_frame: int
     dt: Array
 
-    def held(self) -> "_Replay":
+    def stop_gradients(self) -> "_Replay":
         """The same without derivatives."""
-        moving = self.at(jnp.zeros(self.dt.shape, jnp.int32))
-        step = _constant(self.step, moving, self.moment(jnp.zeros(self.dt.shape, jnp.int32), 0), self.dt)
-        gap = _constant(self.gap, self.dt, moving.state.position)
+        moving = self.take_frame(jnp.zeros(self.dt.shape, jnp.int32))
+        step = _stop_closure_gradients(self.step, moving, self.moment(jnp.zeros(self.dt.shape, jnp.int32), 0), self.dt)
+        signed_distance = _stop_closure_gradients(self.signed_distance, self.dt, moving.state.position)
         return _Replay(
-            lax.stop_gradient(self.frames), step, gap, self.first_step, self.every, lax.stop_gradient(self.dt)
+            lax.stop_gradient(self.frames),
+            step,
+            signed_distance,
+            self.first_step,
+            self.steps_per_frame,
+            lax.stop_gradient(self.dt),
         )
 
     def moment(self, frame: Array, i: ArrayLike) -> Moment:
         """When the step begins that comes i steps after a frame."""
-        return moment_at(self.first_step + frame * self.every + i, self.dt, self.dt.dtype)
+        return moment_at(self.first_step + frame * self.steps_per_frame + i, self.dt, self.dt.dtype)
 
-    def at(self, frame: Array) -> Any:
+    def take_frame(self, frame: Array) -> Any:
         """What changes, as it was at a frame of its own for each lane."""
-        return jax.tree.map(lambda leaf: _picked(leaf, frame), self.frames)
+        return jax.tree.map(lambda leaf: _take_frames(leaf, frame), self.frames)
 
-    def signed(self, t: Array, moving: Any) -> Array:
+    def measure_distance(self, t: Array, moving: Any) -> Array:
         """The gap; zero where it is less than rounding, or what starts on the surface would cross it at once."""
-        value, x = self.gap(t, moving.state.position), moving.state.position
+        value, x = self.signed_distance(t, moving.state.position), moving.state.position
         size = jnp.broadcast_to(norm(x), value.shape) if x.ndim == value.ndim + 1 else jnp.max(norm(x), axis=-1)
         return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(x.dtype).eps) * size, 0.0, value)
 
 
-def _unit_crossing(run: Any, gap: Callable, way: Array, own: Callable) -> Crossing:
+def _find_unit_crossings(run: Any, signed_distance: Callable, way: Array, own: Callable) -> Crossing:
     """The first crossing of every lane, or, where they are coupled, of one node in every scene, which `own` picks."""
-    replay = _replay(run, gap)
-    place = _search(replay.held(), way)
-    moving = replay.at(place.frame)
+    replay = _build_replay(run, signed_distance)
+    place = _find_crossing_step(replay.stop_gradients(), way)
+    moving = replay.take_frame(place.frame)
 
     def forward(i, moving):
         after = replay.step(moving, replay.moment(place.frame, i), replay.dt)
-        return jax.tree.map(lambda a, b: jnp.where(wide(i < place.step, a), a, b), after, moving)
+        return jax.tree.map(lambda a, b: jnp.where(append_axes(i < place.step, a), a, b), after, moving)
 
-    if replay.every > 1:
-        moving = repeat(forward, moving, jnp.zeros((), jnp.int32), replay.every - 1)
+    if replay.steps_per_frame > 1:
+        moving = repeat_steps(forward, moving, jnp.zeros((), jnp.int32), replay.steps_per_frame - 1)
     begun = replay.moment(place.frame, place.step)
     side = jnp.where(place.before < 0, -1.0, 1.0).astype(replay.dt.dtype)
 
     def left(duration):
-        return side * replay.gap(now(begun + duration), replay.step(moving, begun, duration).state.position)
+        return side * replay.signed_distance(
+            to_float_time(begun + duration), replay.step(moving, begun, duration).state.position
+        )
 
-    numbers, left = _hoisted(left, replay.dt)  # the root moves with all that the path depends on
+    numbers, left = _hoist_closure(left, replay.dt)  # the root moves with all that the path depends on
     tolerance = 4 * float(jnp.finfo(replay.dt.dtype).eps) * replay.dt
     values = (side * place.before, side * place.after)
     search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
-    duration = first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
+    duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
     x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
-    told = lambda leaf: jnp.where(wide(place.found, leaf), leaf, jnp.nan)  # noqa: E731
-    return Crossing(told(now(begun + duration)), told(x), told(v), place.found)
+    reported = lambda leaf: jnp.where(append_axes(place.found, leaf), leaf, jnp.nan)  # noqa: E731
+    return Crossing(reported(to_float_time(begun + duration)), reported(x), reported(v), place.found)
 
 
-def _replay(run: Any, gap: Callable) -> _Replay:
+def _build_replay(run: Any, signed_distance: Callable) -> _Replay:
     """The run made ready to be stepped again."""
     scene, film, shape = run.scene, run.film, run.scene.status_shape
     changes = jax.tree.map(lambda a, b: a.ndim < b.ndim, scene, film)
     frames, (first, still) = eqx.filter(film, changes), eqx.partition(scene, changes)
-    _demand_apart(first, shape)
+    _demand_unshared_memory(first, shape)
     dt = jnp.broadcast_to(run.dt, shape)
 
     def step(moving, t, dt):
         return eqx.filter(eqx.combine(moving, still).step(run.stepper, t, dt), changes)
 
-    return _Replay(frames, step, gap, run.first_step, run.save_every, dt)
+    return _Replay(frames, step, signed_distance, run.first_step, run.save_every, dt)
 
 
-def _search(replay: _Replay, way: Array) -> _Place:
+def _find_crossing_step(replay: _Replay, way: Array) -> _CrossingStep:
     """Frame and step of the first crossing, by stepping again through the frames between which there may be one."""
     shape, zero = replay.dt.shape, jnp.zeros(replay.dt.shape, jnp.int32)
-    hopes = _hopes(replay, way)
-    numbers = jnp.arange(len(hopes), dtype=jnp.int32).reshape(-1, *(1 for _ in shape))
-    ahead = lambda cursor: hopes & (numbers >= cursor[None])  # noqa: E731
+    candidates = _find_candidate_intervals(replay, way)
+    numbers = jnp.arange(len(candidates), dtype=jnp.int32).reshape(-1, *(1 for _ in shape))
+    ahead = lambda cursor: candidates & (numbers >= cursor[None])  # noqa: E731
 
     def going(carry):
         cursor, place = carry
@@ -190,44 +197,50 @@ def _search(replay: _Replay, way: Array) -> _Place:
     def look(carry):
         cursor, place = carry
         frame = jnp.argmax(ahead(cursor), axis=0).astype(jnp.int32)
-        seen = _stepped_through(replay, frame, way)
+        seen = _search_interval(replay, frame, way)
         new = seen.found & jnp.any(ahead(cursor), axis=0) & ~place.found
         return frame + 1, jax.tree.map(lambda a, b: jnp.where(new, a, b), seen, place)
 
     nothing = jnp.zeros(shape, replay.dt.dtype)
-    place = _Place(zero, zero, nothing + 1.0, nothing - 1.0, jnp.zeros(shape, bool))
+    place = _CrossingStep(zero, zero, nothing + 1.0, nothing - 1.0, jnp.zeros(shape, bool))
     return lax.while_loop(going, look, (zero, place))[1]
 
 
-def _stepped_through(replay: _Replay, frame: Array, way: Array) -> _Place:
+def _search_interval(replay: _Replay, frame: Array, way: Array) -> _CrossingStep:
     """The first step after a frame at whose end the gap has another sign than at its start."""
 
     def one(i, carry):
         moving, before, place = carry
         t = replay.moment(frame, i)
         moving = replay.step(moving, t, replay.dt)
-        after = replay.signed(now(t + replay.dt), moving)
+        after = replay.measure_distance(to_float_time(t + replay.dt), moving)
         here = _crosses(before, after, way) & ~place.found
-        new = _Place(frame, jnp.full_like(frame, i), before, after, here)
+        new = _CrossingStep(frame, jnp.full_like(frame, i), before, after, here)
         return moving, after, jax.tree.map(lambda a, b: jnp.where(here, a, b), new, place)
 
-    moving = replay.at(frame)
-    gap = replay.signed(now(replay.moment(frame, 0)), moving)
-    start = (moving, gap, _Place(frame, jnp.zeros_like(frame), gap, gap, jnp.zeros(gap.shape, bool)))
-    return lax.fori_loop(0, replay.every, one, start)[2]
+    moving = replay.take_frame(frame)
+    signed_distance = replay.measure_distance(to_float_time(replay.moment(frame, 0)), moving)
+    start = (
+        moving,
+        signed_distance,
+        _CrossingStep(
+            frame, jnp.zeros_like(frame), signed_distance, signed_distance, jnp.zeros(signed_distance.shape, bool)
+        ),
+    )
+    return lax.fori_loop(0, replay.steps_per_frame, one, start)[2]
 
 
-def _hopes(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:
+def _find_candidate_intervals(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:
     """Between which frames there may be a crossing: where the cubic through them changes its sign, which may be at neither."""
 
     def gap_and_rate(frame, moving):
-        t, one = now(replay.moment(jnp.full(replay.dt.shape, frame), 0)), jnp.ones_like(replay.dt)
-        _, rate = jax.jvp(replay.gap, (t, moving.state.position), (one, moving.state.velocity))
-        return replay.signed(t, moving), replay.every * replay.dt * rate
+        t, one = to_float_time(replay.moment(jnp.full(replay.dt.shape, frame), 0)), jnp.ones_like(replay.dt)
+        _, rate = jax.jvp(replay.signed_distance, (t, moving.state.position), (one, moving.state.velocity))
+        return replay.measure_distance(t, moving), replay.steps_per_frame * replay.dt * rate
 
     numbers = jnp.arange(len(replay.frames.state.position), dtype=jnp.int32)
-    gap, rate = jax.vmap(gap_and_rate)(numbers, replay.frames)
-    d0, d1, r0, r1 = gap[:-1], gap[1:], rate[:-1], rate[1:]
+    signed_distance, rate = jax.vmap(gap_and_rate)(numbers, replay.frames)
+    d0, d1, r0, r1 = signed_distance[:-1], signed_distance[1:], rate[:-1], rate[1:]
     b, a = 3 * (d1 - d0) - 2 * r0 - r1, r0 + r1 - 2 * (d1 - d0)
     root = b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(b * b - 3 * a * r0, 0.0))
     # the two places where it is level, by quotients that do not cancel; what is no number there is no place
@@ -244,13 +257,13 @@ def _crosses(before: Array, after: Array, way: Array) -> Array:
     return (falls & (way <= 0)) | (rises & (way >= 0))
 
 
-def _constant(function: Callable, *examples: Any) -> Callable:
+def _stop_closure_gradients(function: Callable, *examples: Any) -> Callable:
     """The function without derivatives by what it closes over."""
-    numbers, pure = _hoisted(function, *examples)
+    numbers, pure = _hoist_closure(function, *examples)
     return partial(pure, lax.stop_gradient(numbers))
 
 
-def _hoisted(function: Callable, *examples: Any) -> tuple[Any, Callable]:
+def _hoist_closure(function: Callable, *examples: Any) -> tuple[Any, Callable]:
     """Every array that a function closes over, and the function with these as its first argument."""
     numbers, rest = eqx.partition(
         eqx.filter_closure_convert(lambda *arguments: function(*arguments), *examples), eqx.is_array
@@ -258,7 +271,7 @@ def _hoisted(function: Callable, *examples: Any) -> tuple[Any, Callable]:
     return numbers, lambda numbers, *arguments: eqx.combine(numbers, rest)(*arguments)
 
 
-def _picked(leaf: Array, frame: Array) -> Array:
+def _take_frames(leaf: Array, frame: Array) -> Array:
     """The entry of each lane at a frame of its own."""
     if not frame.ndim:
         return leaf[frame]
@@ -266,20 +279,20 @@ def _picked(leaf: Array, frame: Array) -> Array:
     return jnp.take_along_axis(leaf, index, axis=0)[0]
 
 
-def _checked_gap(surface: Any, scene: Any) -> Callable:
+def _get_distance_function(surface: Any, scene: Any) -> Callable:
     """The surface's gap, if it gives a number for each lane."""
-    gap = getattr(surface, "gap", surface)
+    signed_distance = getattr(surface, "signed_distance", surface)
     t = jnp.zeros(scene.status_shape, scene.state.dtype)
-    seen = jax.eval_shape(gap, t, scene.state.position)
+    seen = jax.eval_shape(signed_distance, t, scene.state.position)
     if seen.shape != scene.state.lanes:
         raise ValueError(
             f"crossing: the surface's gap(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
             "one distance [m] for each, e.g. position[..., 1] - 2.0."
         )
-    return gap
+    return signed_distance
 
 
-def _demand_apart(changing: Any, shape: tuple[int, ...]) -> None:
+def _demand_unshared_memory(changing: Any, shape: tuple[int, ...]) -> None:
     """Raise a ValueError if lanes share something that changes: they are stepped from different frames."""
     if any(leaf.shape[: len(shape)] != shape for leaf in jax.tree.leaves(changing)):
         raise ValueError(

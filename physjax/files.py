@@ -20,7 +20,7 @@ RUN_FORMAT = 1
 
 
 @contextmanager
-def replacing(path: str | os.PathLike, mode: str = "w", *, durable: bool = False) -> Iterator[IO]:
+def write_atomically(path: str | os.PathLike, mode: str = "w", *, durable: bool = False) -> Iterator[IO]:
     """Open a temporary file that takes the place of `path` when the block ends well, and vanishes when it does not.
 
     A `durable` one is on the disk, with its name, before this returns: it outlives a machine that loses its power.
@@ -37,7 +37,7 @@ def replacing(path: str | os.PathLike, mode: str = "w", *, durable: bool = False
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
+        os.chmod(temporary, 0o666 & ~_read_umask())
         os.replace(temporary, path)
         if durable:
             _sync_folder(path.parent)
@@ -47,7 +47,7 @@ def replacing(path: str | os.PathLike, mode: str = "w", *, durable: bool = False
 
 
 @contextmanager
-def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
+def write_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
     """Fill a temporary folder that becomes `path` when the block ends well, and vanishes when it does not.
 
     Raises FileNotFoundError when the folder that `path` is to be in does not exist, and FileExistsError when there is
@@ -61,7 +61,7 @@ def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     try:
         yield temporary
-        temporary.chmod(0o777 & ~_umask())
+        temporary.chmod(0o777 & ~_read_umask())
         if path.exists():
             path.rmdir()
         os.replace(temporary, path)
@@ -70,7 +70,7 @@ def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
         raise
 
 
-def writable_folder(path: str | os.PathLike) -> Path:
+def ensure_writable_folder(path: str | os.PathLike) -> Path:
     """Create the folder if need be and make sure that files can be written there; an OSError in plain words otherwise."""
     folder = Path(path)
     try:
@@ -96,7 +96,7 @@ def read_arrays(path: str | os.PathLike, writer: str) -> dict[str, np.ndarray]:
         raise ValueError(f"load: {file} is damaged or not an .npz file (it holds one array).") from error
 
 
-def demand_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
+def demand_saved_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise a ValueError that names the file and the array which no run could have written."""
     needed = {"time", "ok", "first_step", "save_every", "steps", "method"}
     if any(name.startswith(("final_state.", "first_bad_step")) for name in arrays):  # those of no reference solver
@@ -202,7 +202,7 @@ def _sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def _umask() -> int:
+def _read_umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask

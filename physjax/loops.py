@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 LAST_STEP = 2**31 - 1
 """The highest number that a step can have: steps are counted in 32 bits."""
-NUDGE = 1 / 64
+LARGEST_SNAP_SHARE = 1 / 64
 """The largest share of a step by which a moment is moved to the end of one."""
 
 
@@ -32,7 +32,7 @@ class Moment(eqx.Module):
     """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what is over.
 
     Differences are taken before they are rounded, so that 5 ms are 5 ms after a day in float32, where the time itself is
-    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene are told `now(moment)`, a float.
+    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene are told `to_float_time(moment)`, a float.
     """
 
     start: Float[Array, "..."] = eqx.field(metadata=RECORD)
@@ -54,32 +54,34 @@ class Moment(eqx.Module):
 
     def __jax_array__(self) -> Array:
         """The time as a float."""
-        return now(self)
+        return to_float_time(self)
 
-    def until(self, time: Array, rest: ArrayLike = 0.0) -> Array:
+    def time_until(self, time: Array, rest: ArrayLike = 0.0) -> Array:
         """How long it is until a time [s], given as a number and what its rounding left out; negative where it is over."""
         ahead = self._ahead(time, rest)
         return ahead if self.elapsed is None else ahead - self.elapsed
 
-    def until_on_grid(self, time: Array, rest: ArrayLike = 0.0) -> Array:
+    def time_until_on_grid(self, time: Array, rest: ArrayLike = 0.0) -> Array:
         """How long it is until a time [s], or until the end of a step that differs from it by no more than rounding."""
         ahead = self._ahead(time, rest)
         steps = lax.stop_gradient(ahead / self.step)
         near = jnp.round(steps)
-        rounding = jnp.minimum(2 * float(jnp.finfo(ahead.dtype).eps) * (1 + jnp.abs(time) / self.step), NUDGE)
+        rounding = jnp.minimum(
+            2 * float(jnp.finfo(ahead.dtype).eps) * (1 + jnp.abs(time) / self.step), LARGEST_SNAP_SHARE
+        )
         # moved as a constant, so that derivatives by the time go on
         move = jnp.where(jnp.abs(steps - near) <= rounding, near * self.step - ahead, 0.0)
         ahead = ahead + lax.stop_gradient(move)
         return ahead if self.elapsed is None else ahead - self.elapsed
 
-    def since(self, time: Array, rest: ArrayLike = 0.0) -> tuple[Array, Array]:
+    def time_since(self, time: Array, rest: ArrayLike = 0.0) -> tuple[Array, Array]:
         """How long ago a time [s] was, and what rounding left out of that."""
-        whole, left = exact_sum(rounded(self.start), -time)
+        whole, left = exact_sum(force_rounding(self.start), -time)
         left = left + (self.rest - rest)
         return whole, left if self.elapsed is None else left + self.elapsed
 
     def _ahead(self, time: Array, rest: ArrayLike) -> Array:
-        return (time - rounded(self.start)) + (lax.stop_gradient(rest) - self.rest)
+        return (time - force_rounding(self.start)) + (lax.stop_gradient(rest) - self.rest)
 
 
 Time = ArrayLike | Moment
@@ -93,35 +95,35 @@ def moment_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Moment:
     return Moment(start, rest, dt)
 
 
-def now(t: Any) -> Any:
+def to_float_time(t: Any) -> Any:
     """The time as a float, which is what parts of a scene see."""
     if not isinstance(t, Moment):
         return t
     return t.start if t.elapsed is None else t.start + t.elapsed
 
 
-def told(part: Any, t: Any) -> Any:
+def time_for_part(part: Any, t: Any) -> Any:
     """The time as a part of a scene is told it: the moment itself only if it asks for moments, as those of the library."""
-    return t if getattr(part, "sees_moments", False) is True else now(t)
+    return t if getattr(part, "sees_moments", False) is True else to_float_time(t)
 
 
-def told_method(method: Any, t: Any) -> Any:
+def time_for_method(method: Any, t: Any) -> Any:
     """The time as a method is told it, which may have another inside: a user's gets a float."""
     inner = getattr(method, "method", None)
-    return t if is_ours(method) and (inner is None or is_ours(inner)) else now(t)
+    return t if is_library_part(method) and (inner is None or is_library_part(inner)) else to_float_time(t)
 
 
-def at_now(response: Callable, motion: Callable, scene: Any, t: Any, dt: ArrayLike) -> Any:
+def respond_at_float_time(response: Callable, motion: Callable, scene: Any, t: Any, dt: ArrayLike) -> Any:
     """A user's response, which is told the time as a float."""
-    return response(motion, scene, now(t), dt)
+    return response(motion, scene, to_float_time(t), dt)
 
 
-def is_ours(part: Any) -> bool:
+def is_library_part(part: Any) -> bool:
     """Whether a function or a module is the library's own, which may be told a moment instead of a float."""
     return getattr(getattr(part, "function", part), "__module__", "").startswith("physjax.")
 
 
-def rounded(number: Float[Array, "..."]) -> Float[Array, "..."]:
+def force_rounding(number: Float[Array, "..."]) -> Float[Array, "..."]:
     """The number as it is, rounded before anything is added to it: no compiler may contract both across this bound."""
     return jnp.maximum(number, jnp.finfo(number.dtype).min)
 
@@ -129,7 +131,7 @@ def rounded(number: Float[Array, "..."]) -> Float[Array, "..."]:
 def exact_sum(a: Array, b: Array) -> tuple[Array, Array]:
     """a + b, and what rounding left out of it (D. E. Knuth); the derivative is that of the sum."""
     total = a + b
-    x, y, s = lax.stop_gradient((a, b, rounded(total)))
+    x, y, s = lax.stop_gradient((a, b, force_rounding(total)))
     part = s - x
     return total, (x - (s - part)) + (y - part)
 
@@ -143,8 +145,8 @@ def exact_multiple(count: Array, number: Array) -> tuple[Array, Array]:
     product = count.astype(dtype) * number
     low = count & 0xFFFF
     low, high = low.astype(dtype), (count - low).astype(dtype)
-    a, b, c = _in_three(lax.stop_gradient(number))
-    rest = high * a - rounded(lax.stop_gradient(product))
+    a, b, c = _split_in_three(lax.stop_gradient(number))
+    rest = high * a - force_rounding(lax.stop_gradient(product))
     return product, ((((rest + high * b) + low * a) + high * c) + low * b) + low * c
 
 
@@ -155,12 +157,12 @@ def exact_quotient(count: Array, number: Array) -> tuple[Array, Array]:
     q, d = lax.stop_gradient((quotient, number))
     low = count & 0xFFFF
     left = ((count - low).astype(d.dtype) - whole) + low.astype(d.dtype)
-    (qa, qb), (da, db) = _in_two(q), _in_two(d)
+    (qa, qb), (da, db) = _split_in_two(q), _split_in_two(d)
     rest = ((whole - qa * da) - qa * db) - qb * da
     return quotient, ((rest - qb * db) + left) / d
 
 
-def rest_of(value: Any, known: Any = None) -> Array:
+def float32_remainder(value: Any, known: Any = None) -> Array:
     """What float32 cannot hold of a number that a user gives, so that a moment far from t = 0 is not moved.
 
     Nothing where the number is float32 already; then what is `known` of it stays.
@@ -178,7 +180,7 @@ def rest_of(value: Any, known: Any = None) -> Array:
     return jnp.asarray(np.where(np.isfinite(rest), rest, 0.0), np.float32)
 
 
-def rest_in(value: Array, rest: Array) -> Array:
+def cast_remainder(value: Array, rest: Array) -> Array:
     """The rest of a number as its dtype has it: none where the number holds it already, or is no longer the one it is of."""
     value, rest = lax.stop_gradient((value, rest.astype(value.dtype)))
     bare = value.astype(np.float32).astype(value.dtype) == value
@@ -186,7 +188,7 @@ def rest_in(value: Array, rest: Array) -> Array:
     return jnp.where(bare & (jnp.abs(rest) <= half * jnp.abs(value)), rest, 0.0)
 
 
-def _in_three(number: Array) -> tuple[Array, Array, Array]:
+def _split_in_three(number: Array) -> tuple[Array, Array, Array]:
     """A number as the sum of three of a third of its digits."""
     bits = jnp.finfo(number.dtype)
     short = partial(lax.reduce_precision, exponent_bits=bits.nexp, mantissa_bits=bits.nmant // 3)
@@ -195,20 +197,20 @@ def _in_three(number: Array) -> tuple[Array, Array, Array]:
     return first, second, number - first - second
 
 
-def _in_two(number: Array) -> tuple[Array, Array]:
+def _split_in_two(number: Array) -> tuple[Array, Array]:
     """A number as the sum of two of half its digits."""
     bits = jnp.finfo(number.dtype)
     first = lax.reduce_precision(number, exponent_bits=bits.nexp, mantissa_bits=bits.nmant // 2)
     return first, number - first
 
 
-def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
+def repeat_steps(step: Callable, carry: Any, first: Array, count: int) -> Any:
     """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
     if count == 1:
         return step(first, carry)
     if jax.config.jax_disable_jit:  # a checkpoint would trace it all the same, and hide the numbers from who looks
         return reduce(lambda carry, i: step(first + i, carry), range(count), carry)
-    inner = _near_root(count) if count > 16 else count
+    inner = _choose_chunk_length(count) if count > 16 else count
     outer, rest = divmod(count, inner)
 
     def run(carry, first, length):
@@ -221,7 +223,7 @@ def repeat(step: Callable, carry: Any, first: Array, count: int) -> Any:
     return run(carry, first + outer * inner, rest) if rest else carry
 
 
-def _near_root(count: int) -> int:
+def _choose_chunk_length(count: int) -> int:
     """A length for chunks of about √count: one that leaves no rest, if there is one, since a rest is compiled once more."""
     root = math.isqrt(count)
     exact = [length for length in range(root // 2, 2 * root + 1) if count % length == 0]

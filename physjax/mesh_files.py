@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-_KINDS = {
+_PLY_DTYPES = {
     **{name: "i1" for name in ("char", "int8")},
     **{name: "u1" for name in ("uchar", "uint8")},
     **{name: "i2" for name in ("short", "int16")},
@@ -23,17 +23,17 @@ _KINDS = {
     **{name: "f4" for name in ("float", "float32")},
     **{name: "f8" for name in ("double", "float64")},
 }
-_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_MARKS = [
+_PLY_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_BYTE_ORDER_MARKS = [
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF32_LE, "utf-32"),  # begins as UTF-16's does
     (codecs.BOM_UTF32_BE, "utf-32"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 ]
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
-_CORNER = re.compile(r"([+-]?\d+)(?:/([+-]?\d+)?(?:/([+-]?\d+)?)?)?", re.ASCII)
-_CURVED = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp", "call"}
+_NUMBER_PATTERN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
+_CORNER_PATTERN = re.compile(r"([+-]?\d+)(?:/([+-]?\d+)?(?:/([+-]?\d+)?)?)?", re.ASCII)
+_CURVED_STATEMENTS = {"curv", "curv2", "surf", "bzp", "bsp", "cdc", "cdp", "call"}
 
 Polygons = list[Sequence[int]]
 
@@ -49,13 +49,13 @@ def read_obj(file: Path, triangulate: bool = False) -> tuple[np.ndarray, Polygon
     """Lines `v x y z` and `f a b c`, each a, a/t, a//n or a/t/n, counted from 1 or, if negative, back from the last."""
     vertices: list[list[float]] = []
     faces: Polygons = []
-    for number, kind, words in _obj_statements(file):
+    for number, kind, words in _split_obj_statements(file):
         if kind == "v":
-            vertices.append(_obj_vertex(file, number, words))
+            vertices.append(_parse_obj_vertex(file, number, words))
         elif kind in ("f", "fo"):
-            faces.append(_obj_face(file, number, words, len(vertices)))
+            faces.append(_parse_obj_face(file, number, words, len(vertices)))
             demand_corners(f"{file.name}: line {number} has {len(words)} entries", len(words), triangulate)
-        elif kind in _CURVED or kind in ("V", "F"):
+        elif kind in _CURVED_STATEMENTS or kind in ("V", "F"):
             raise ValueError(
                 f"{file.name}: line {number} begins with {kind!r}, expected vertices (v) and flat faces (f)."
             )
@@ -64,9 +64,9 @@ def read_obj(file: Path, triangulate: bool = False) -> tuple[np.ndarray, Polygon
     return np.array(vertices), faces
 
 
-def _obj_statements(file: Path) -> Any:
+def _split_obj_statements(file: Path) -> Any:
     """Every statement with the number of its first line, its first word and the others; one may go on after a backslash."""
-    content = _unmarked(file.read_bytes())
+    content = _strip_byte_order_mark(file.read_bytes())
     if b"\0" in content:
         raise ValueError(f"{file.name}: holds zero bytes, expected text: UTF-8, or UTF-16 with its byte order mark.")
     begun, first = "", 0
@@ -82,8 +82,8 @@ def _obj_statements(file: Path) -> Any:
         yield first, kind, words
 
 
-def _obj_vertex(file: Path, number: int, words: list[str]) -> list[float]:
-    if not all(map(_NUMBER.fullmatch, words)):
+def _parse_obj_vertex(file: Path, number: int, words: list[str]) -> list[float]:
+    if not all(map(_NUMBER_PATTERN.fullmatch, words)):
         raise ValueError(f"{file.name}: line {number} is not a mesh's: 'v {' '.join(words)[:60]}', expected numbers.")
     if len(words) not in (3, 4, 6, 7):
         raise ValueError(
@@ -95,9 +95,9 @@ def _obj_vertex(file: Path, number: int, words: list[str]) -> list[float]:
     return place
 
 
-def _obj_face(file: Path, number: int, words: list[str], known: int) -> list[int]:
+def _parse_obj_face(file: Path, number: int, words: list[str], known: int) -> list[int]:
     """The corners of a face after so many vertices, counted from 0."""
-    matched = [_CORNER.fullmatch(word) for word in words]
+    matched = [_CORNER_PATTERN.fullmatch(word) for word in words]
     if not all(matched):
         raise ValueError(
             f"{file.name}: line {number} is not a mesh's: 'f {' '.join(words)[:60]}', expected corners a, a/t, a//n or a/t/n."
@@ -125,9 +125,9 @@ class _Property(NamedTuple):
 
 def read_ply(file: Path, triangulate: bool = False) -> tuple[np.ndarray, Polygons]:
     """Elements `vertex` (with x, y, z) and `face` (with a list of indices), as text or binary of either order."""
-    order, elements, body = _ply_header(file.name, _unmarked(file.read_bytes()))
-    read = _Text(file.name, body) if order == "" else _Binary(file.name, body, order)
-    found = {element: _ply_element(read, element, count, columns) for element, count, columns in elements}
+    order, elements, body = _parse_ply_header(file.name, _strip_byte_order_mark(file.read_bytes()))
+    read = _TextReader(file.name, body) if order == "" else _BinaryReader(file.name, body, order)
+    found = {element: _read_ply_element(read, element, count, columns) for element, count, columns in elements}
     read.demand_end()
     if not {"vertex", "face"} <= set(found):
         raise ValueError(f"{file.name}: has the elements {sorted(found)}, expected vertex and face.")
@@ -136,13 +136,13 @@ def read_ply(file: Path, triangulate: bool = False) -> tuple[np.ndarray, Polygon
         raise ValueError(
             f"{file.name}: has vertices with {', '.join(kinds) or 'nothing'}, expected x, y and z, a number each."
         )
-    polygons = _ply_corners(file.name, elements, found["face"])
+    polygons = _find_ply_corners(file.name, elements, found["face"])
     for i, polygon in enumerate(polygons):
         demand_corners(f"{file.name}: face {i} has {len(polygon)} corners", len(polygon), triangulate)
     return np.stack([found["vertex"][axis] for axis in "xyz"], axis=-1), polygons
 
 
-def _ply_corners(name: str, elements: list, faces: dict[str, Any]) -> Polygons:
+def _find_ply_corners(name: str, elements: list, faces: dict[str, Any]) -> Polygons:
     """The list of vertices among the properties of a face: by its name, or as the only list of whole numbers."""
     columns = next(columns for element, _, columns in elements if element == "face")
     lists = [c.name for c in columns if c.length and c.kind[0] in "iu"]
@@ -157,7 +157,7 @@ def _ply_corners(name: str, elements: list, faces: dict[str, Any]) -> Polygons:
     return faces[named[0]]
 
 
-def _ply_header(name: str, content: bytes) -> tuple[str, list, bytes]:
+def _parse_ply_header(name: str, content: bytes) -> tuple[str, list, bytes]:
     """The byte order, for each element its name, count and columns, and what comes after the header."""
     begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
     end = begin and re.search(begin[1] + rb"end_header[ \t]*(?:" + begin[1] + rb"|$)", content)
@@ -168,17 +168,17 @@ def _ply_header(name: str, content: bytes) -> tuple[str, list, bytes]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 good = True
-            case ["format", kind, "1.0"] if kind in _ORDERS and order is None:
-                order, good = _ORDERS[kind], True
+            case ["format", kind, "1.0"] if kind in _PLY_BYTE_ORDERS and order is None:
+                order, good = _PLY_BYTE_ORDERS[kind], True
             case ["element", title, count] if re.fullmatch(r"\d+", count, re.ASCII):
                 good = title not in [element for element, *_ in elements]
                 elements.append((title, int(count), []))
-            case ["property", "list", length, kind, title] if elements and {length, kind} <= _KINDS.keys():
-                good = _KINDS[length][0] != "f" and title not in [column.name for column in elements[-1][2]]
-                elements[-1][2].append(_Property(title, _KINDS[kind], _KINDS[length]))
-            case ["property", kind, title] if elements and kind in _KINDS:
+            case ["property", "list", length, kind, title] if elements and {length, kind} <= _PLY_DTYPES.keys():
+                good = _PLY_DTYPES[length][0] != "f" and title not in [column.name for column in elements[-1][2]]
+                elements[-1][2].append(_Property(title, _PLY_DTYPES[kind], _PLY_DTYPES[length]))
+            case ["property", kind, title] if elements and kind in _PLY_DTYPES:
                 good = title not in [column.name for column in elements[-1][2]]
-                elements[-1][2].append(_Property(title, _KINDS[kind], None))
+                elements[-1][2].append(_Property(title, _PLY_DTYPES[kind], None))
             case _:
                 good = False
         if not good:
@@ -188,7 +188,7 @@ def _ply_header(name: str, content: bytes) -> tuple[str, list, bytes]:
     return order, elements, content[end.end() :]
 
 
-def _ply_element(read: Any, element: str, count: int, columns: list[_Property]) -> dict[str, Any]:
+def _read_ply_element(read: Any, element: str, count: int, columns: list[_Property]) -> dict[str, Any]:
     """The columns of an element by name, arrays `(count, ...)`; lists of several lengths as a list of arrays."""
     if not count or not columns:
         return {column.name: np.zeros((0, 0) if column.length else 0) for column in columns}
@@ -203,7 +203,7 @@ def _ply_element(read: Any, element: str, count: int, columns: list[_Property]) 
     }
 
 
-class _Binary:
+class _BinaryReader:
     """Rows of a PLY element from bytes."""
 
     def __init__(self, name: str, body: bytes, order: str):
@@ -238,8 +238,8 @@ class _Binary:
         """The next row: a number or an array for each column."""
         found = []
         for column in columns:
-            length = 1 if column.length is None else int(self._numbers(element, column.length, 1)[0])
-            values = self._numbers(element, column.kind, length)
+            length = 1 if column.length is None else int(self._read_numbers(element, column.length, 1)[0])
+            values = self._read_numbers(element, column.kind, length)
             found.append(values if column.length else values[0])
         return found
 
@@ -248,7 +248,7 @@ class _Binary:
         if rest := len(self.body[self.at :].strip(b"\0\r\n\t ")):
             raise ValueError(f"{self.name}: holds {rest} bytes more than its header says: its counts are wrong.")
 
-    def _numbers(self, element: str, kind: str, count: int) -> np.ndarray:
+    def _read_numbers(self, element: str, kind: str, count: int) -> np.ndarray:
         size = np.dtype(kind).itemsize
         if count < 0 or len(self.body) - self.at < count * size:
             raise ValueError(f"{self.name}: is truncated: the element {element!r} does not fit.")
@@ -256,7 +256,7 @@ class _Binary:
         return np.frombuffer(self.body, self.order + kind, count, self.at - count * size)
 
 
-class _Text(_Binary):
+class _TextReader(_BinaryReader):
     """Rows of a PLY element from words."""
 
     def __init__(self, name: str, body: bytes):
@@ -274,7 +274,7 @@ class _Text(_Binary):
             if column.length and (words[:, at] != str(length)).any():
                 return None
             part = words[:, at + wide - length : at + wide] if column.length else words[:, at]
-            table[column.name] = self._converted(element, column.kind, part.ravel()).reshape(part.shape)
+            table[column.name] = self._convert(element, column.kind, part.ravel()).reshape(part.shape)
             at += wide
         self.at += count * width
         return table
@@ -284,15 +284,15 @@ class _Text(_Binary):
         if rest := len(self.words) - self.at:
             raise ValueError(f"{self.name}: holds {rest} numbers more than its header says: its counts are wrong.")
 
-    def _numbers(self, element: str, kind: str, count: int) -> np.ndarray:
+    def _read_numbers(self, element: str, kind: str, count: int) -> np.ndarray:
         if count < 0 or len(self.words) - self.at < count:
             raise ValueError(f"{self.name}: is truncated: the element {element!r} does not fit.")
         self.at += count
-        return self._converted(element, kind, self.words[self.at - count : self.at])
+        return self._convert(element, kind, self.words[self.at - count : self.at])
 
-    def _converted(self, element: str, kind: str, words: Sequence[str]) -> np.ndarray:
+    def _convert(self, element: str, kind: str, words: Sequence[str]) -> np.ndarray:
         """Words as numbers; whole ones must be whole, and fit."""
-        bad = next((word for word in words if not _NUMBER.fullmatch(word)), None)
+        bad = next((word for word in words if not _NUMBER_PATTERN.fullmatch(word)), None)
         if bad is not None:
             raise ValueError(f"{self.name}: holds {str(bad)!r}, which is not a number, in the element {element!r}.")
         numbers = np.array(words, float)
@@ -308,9 +308,9 @@ class _Text(_Binary):
         return numbers.astype(np.int64)
 
 
-def _unmarked(content: bytes) -> bytes:
+def _strip_byte_order_mark(content: bytes) -> bytes:
     """The content without the mark that some editors begin a text with; other encodings that have one as UTF-8."""
-    for mark, encoding in _MARKS:
+    for mark, encoding in _BYTE_ORDER_MARKS:
         if content.startswith(mark):
             return content[len(mark) :] if encoding == "utf-8" else content.decode(encoding, errors="replace").encode()
     return content

@@ -9,10 +9,10 @@ import numpy as np
 
 from physjax.mesh_files import Polygons, read_obj, read_ply
 
-_OURS = {".obj": read_obj, ".ply": read_ply}
-_THEIRS = (".stl", ".glb", ".gltf")
+_READERS = {".obj": read_obj, ".ply": read_ply}
+_TRIMESH_SUFFIXES = (".stl", ".glb", ".gltf")
 """Endings of files that trimesh reads, where it is installed."""
-CLOSE = 1e-6
+WELD_DISTANCE_SHARE = 1e-6
 """Vertices that are nearer than this, relative to the size of a mesh, are one, unless an edge is as short."""
 
 
@@ -26,20 +26,20 @@ def read_mesh(path: str | os.PathLike, *, triangulate: bool = False) -> tuple[np
     """
     file = Path(path)
     ending = file.suffix.lower()
-    if ending not in _OURS and ending not in _THEIRS:
+    if ending not in _READERS and ending not in _TRIMESH_SUFFIXES:
         raise ValueError(
-            f"mesh: got {file.name}, expected a file that ends in {' or '.join(_OURS)}, or with trimesh {', '.join(_THEIRS)}."
+            f"mesh: got {file.name}, expected a file that ends in {' or '.join(_READERS)}, or with trimesh {', '.join(_TRIMESH_SUFFIXES)}."
         )
     if not file.is_file():
         raise FileNotFoundError(f"mesh: there is no file {file}.")
-    if ending in _THEIRS:
-        welded = weld(*checked_mesh(*_read_with_trimesh(file), file.name))
+    if ending in _TRIMESH_SUFFIXES:
+        welded = weld(*check_mesh(*_read_with_trimesh(file), file.name))
         return welded.vertices, welded.faces
-    vertices, polygons = _OURS[ending](file, triangulate)
-    return checked_mesh(vertices, _triangles(file.name, vertices, polygons), file.name)
+    vertices, polygons = _READERS[ending](file, triangulate)
+    return check_mesh(vertices, _triangulate(file.name, vertices, polygons), file.name)
 
 
-def checked_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndarray, np.ndarray]:
+def check_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles as arrays, or a ValueError that says what is wrong with them."""
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "iuf":
@@ -64,7 +64,7 @@ def checked_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndar
     return vertices.astype(float), faces.astype(np.int64)
 
 
-class Welded(NamedTuple):
+class WeldedMesh(NamedTuple):
     """Vertices and triangles without vertices that stand in one place; `index[i]` is the vertex that i has become.
 
     `flat` triangles had two corners in one place and are left out.
@@ -76,7 +76,7 @@ class Welded(NamedTuple):
     flat: int
 
 
-def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> Welded:
+def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> WeldedMesh:
     """One vertex instead of several that are nearer than `tolerance` [m]; the first of them stays, in its order.
 
     Unless told, that is a millionth of the mesh's size, or a tenth of its shortest edge where that is less.
@@ -85,12 +85,14 @@ def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> Welded:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    vertices, faces = checked_mesh(vertices, faces)
+    vertices, faces = check_mesh(vertices, faces)
     count = len(vertices)
     if tolerance is None:
         edges = np.sqrt(((vertices[faces] - vertices[np.roll(faces, 1, axis=1)]) ** 2).sum(axis=-1))
         size = np.sqrt((np.ptp(vertices, axis=0) ** 2).sum())
-        tolerance = min(CLOSE * size, edges[edges > CLOSE**2 * size].min(initial=np.inf) / 10)
+        tolerance = min(
+            WELD_DISTANCE_SHARE * size, edges[edges > WELD_DISTANCE_SHARE**2 * size].min(initial=np.inf) / 10
+        )
     pairs = KDTree(vertices).query_pairs(tolerance, output_type="ndarray")
     _, group = connected_components(coo_array((np.ones(len(pairs)), pairs.T), (count, count)), directed=False)
     _, first, group = np.unique(group, return_index=True, return_inverse=True)
@@ -99,10 +101,10 @@ def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> Welded:
     index = place[group.reshape(-1)]
     joined = index[faces]
     flat = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
-    return Welded(vertices[np.sort(first)], joined[~flat], index, int(flat.sum()))
+    return WeldedMesh(vertices[np.sort(first)], joined[~flat], index, int(flat.sum()))
 
 
-def near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
+def find_near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
     """How many pieces, which share no vertex, come within a tenth of the shortest edge of another, and how near [m].
 
     (0, inf) where none do. Such a mesh is most often one whose vertices were rounded differently from face to face.
@@ -124,7 +126,7 @@ def near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
     return len(np.unique(piece[pairs])), float(apart.max())
 
 
-def _triangles(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndarray:
+def _triangulate(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndarray:
     """Faces as triangles: those of more corners as fans around their first corner that sees all the others."""
     if all(len(polygon) == 3 for polygon in polygons):
         return np.array(polygons, np.int64)
@@ -135,7 +137,7 @@ def _triangles(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndarra
         known = ((corners >= 0) & (corners < len(vertices))).all(
             axis=1
         )  # others are refused with triangles of their kind
-        begun = _fan_starts(vertices[corners[known]])
+        begun = _find_fan_starts(vertices[corners[known]])
         if (begun < 0).any():
             first = which[known][int(np.argmax(begun < 0))]
             raise ValueError(
@@ -146,7 +148,7 @@ def _triangles(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndarra
     return np.array([(p[0], p[i], p[i + 1]) for p in fans for i in range(1, len(p) - 1)], np.int64)
 
 
-def _fan_starts(places: np.ndarray) -> np.ndarray:
+def _find_fan_starts(places: np.ndarray) -> np.ndarray:
     """The first corner of each polygon `(polygons, corners, 3)` whose fan has no triangle turned over; -1 without one."""
     away = places - places[:, :1]
     normal = np.cross(away, np.roll(away, -1, axis=1)).sum(axis=1)
@@ -180,8 +182,8 @@ def _read_with_trimesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
 def _demand_whole_stl(file: Path) -> None:
     """Raise a ValueError for an STL file that is cut short, of which trimesh reads what is left."""
     content = file.read_bytes()
-    told = int.from_bytes(content[80:84], "little")
-    if len(content) == 84 + 50 * told:
+    stated = int.from_bytes(content[80:84], "little")
+    if len(content) == 84 + 50 * stated:
         return
     # a solid may have any name
     unnamed = re.sub(rb"(?m)^([ \t]*(?:end)?solid)\b(?!.*\bfacet\s+normal\b).*", rb"\1", content.lower())
@@ -189,6 +191,6 @@ def _demand_whole_stl(file: Path) -> None:
     facets, corners = words.count(b"facet"), words.count(b"vertex")
     if words[:1] != [b"solid"] or words[-1:] != [b"endsolid"] or corners != 3 * facets:
         raise ValueError(
-            f"{file.name}: is not an STL file, or truncated: as a binary one it has {len(content)} bytes and says {told} "
+            f"{file.name}: is not an STL file, or truncated: as a binary one it has {len(content)} bytes and says {stated} "
             f"triangles, as text it has {facets} facets with {corners} vertices."
         )

@@ -1,7 +1,7 @@
 """Point masses, the state of most scenes; and so what a scene asks of any record of moving things.
 
-A record has `lanes` and `dtype`; is `checked` with its mass when a scene is built; tells what a `load` does to it and
-their `total`, how it is `driven` and its `rate` for that; kicks, drifts, and is `held`. A record whose arrays must
+A record has `lanes` and `dtype`; is `validate` with its mass when a scene is built; tells what a `evaluate_load` does to it and
+their `total`, how it is `generalised_force` and its `rate` for that; kicks, drifts, and is `held`. A record whose arrays must
 agree with each other (a quaternion is of length 1) is also `settled` after every step. A scene calls these and knows
 nothing else of what moves in it.
 """
@@ -13,8 +13,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import real_array, real_quantity
-from physjax.loops import Time, told
+from physjax.checks import as_real_array, as_real_quantity
+from physjax.loops import Time, time_for_part
 from physjax.vectors import dot, scale
 
 
@@ -48,19 +48,19 @@ class Particles(NamedTuple):
         """What the errors of a path are measured by: the position [m]."""
         return self.position
 
-    def shown_to(self, force: Any, mass: Float[Array, "..."]) -> tuple["Particles", Float[Array, "..."]]:
+    def view_for_force(self, force: Any, mass: Float[Array, "..."]) -> tuple["Particles", Float[Array, "..."]]:
         """The state and the mass that a force sees."""
         return self, mass
 
-    def load(self, force: Any, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def evaluate_load(self, force: Any, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """What a force does to each lane [N], shaped like the velocity; seen once, while tracing."""
-        return shaped(force, force(told(force, t), self, mass), self.velocity)
+        return check_load_shape(force, force(time_for_part(force, t), self, mass), self.velocity)
 
-    def total(self, terms: Any) -> Float[Array, "*lanes dim"]:
+    def sum_loads(self, terms: Any) -> Float[Array, "*lanes dim"]:
         """The sum of loads [N]."""
-        return added(terms) if terms else jnp.zeros_like(self.velocity)
+        return sum_terms(terms) if terms else jnp.zeros_like(self.velocity)
 
-    def driven(self, scene: Any, t: Time) -> Float[Array, "*lanes dim"]:
+    def generalised_force(self, scene: Any, t: Time) -> Float[Array, "*lanes dim"]:
         """Acceleration [m/s²]."""
         return scene.acceleration(t, self)
 
@@ -76,7 +76,7 @@ class Particles(NamedTuple):
         """x += v dt, the velocity untouched."""
         return Particles(self.position + scale(dt, self.velocity), self.velocity)
 
-    def held(self, free: Float[Array, "*lanes"]) -> "Particles":
+    def hold_lanes(self, free: Float[Array, "*lanes"]) -> "Particles":
         """The state with the velocity of held lanes (free = 0) set to zero."""
         return Particles(self.position, scale(free, self.velocity))
 
@@ -88,9 +88,9 @@ class Particles(NamedTuple):
         """mv [kg m/s]."""
         return scale(mass, self.velocity)
 
-    def checked(self, mass: Any) -> tuple["Particles", Float[Array, "..."]]:
+    def validate(self, mass: Any) -> tuple["Particles", Float[Array, "..."]]:
         """State and mass as floating-point arrays of one dtype that fit; ValueError or TypeError in plain words otherwise."""
-        state = Particles(real_array("position", self.position), real_array("velocity", self.velocity))
+        state = Particles(as_real_array("position", self.position), as_real_array("velocity", self.velocity))
         x, v = state
         if x.ndim == 0 or x.shape != v.shape:
             raise ValueError(
@@ -109,9 +109,9 @@ class Particles(NamedTuple):
                 f"Particles: got position {x.dtype} and velocity {v.dtype}, expected one dtype. Cast one of them."
             )
         for name, array in (("position [m]", x), ("velocity [m/s]", v)):
-            real_quantity(name, array)
+            as_real_quantity(name, array)
         state = Particles(x.astype(x.dtype), v.astype(v.dtype))  # astype makes weakly typed arrays strong
-        mass = real_quantity("mass [kg]", mass, above=0.0).astype(state.dtype)
+        mass = as_real_quantity("mass [kg]", mass, above=0.0).astype(state.dtype)
         if mass.shape not in ((), state.lanes):
             raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {state.lanes}.")
         return state, mass
@@ -123,7 +123,7 @@ def demand_particles(what: str, state: Any, why: str) -> None:
         raise TypeError(f"{what}: got a state of type {type(state).__name__}, expected Particles: {why}.")
 
 
-def added(terms: Any) -> Array:
+def sum_terms(terms: Any) -> Array:
     """The sum of arrays, in order."""
     total, *others = terms
     for term in others:
@@ -131,7 +131,7 @@ def added(terms: Any) -> Array:
     return total
 
 
-def shaped(force: Any, value: Any, expected: Array) -> Array:
+def check_load_shape(force: Any, value: Any, expected: Array) -> Array:
     """The value of a force, if it is shaped as expected, like the velocity; a TypeError in plain words otherwise."""
     shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", type(value))
     if shape == expected.shape and dtype == expected.dtype:
@@ -143,6 +143,6 @@ def shaped(force: Any, value: Any, expected: Array) -> Array:
     )
 
 
-def wide(number: Array, like: Array) -> Array:
+def append_axes(number: Array, like: Array) -> Array:
     """A number of each scene or lane, with the axes of an array of the state."""
     return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))

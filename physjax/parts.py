@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import demand_legal
+from physjax.checks import demand_start_outside
 from physjax.particles import Particles, demand_particles
 from physjax.vectors import scale
 
@@ -31,7 +31,7 @@ def as_module(function: Callable) -> eqx.Module:
     return function if isinstance(function, eqx.Module) else Function(function)
 
 
-def plain_functions(part: Any) -> list[Function]:
+def find_plain_functions(part: Any) -> list[Function]:
     """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
     is_plain = lambda node: isinstance(node, Function)  # noqa: E731
     return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
@@ -43,8 +43,8 @@ class Force(eqx.Module):
     `couples` says whether a lane's force depends on other lanes. `t` [s] is a scalar or per lane. A conservative force
     also gives its `potential(t, state, mass)` [J], shaped like the lanes (a shared energy is halved between its two
     lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
-    One that jumps in time has `during(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
-    `near(t, state, mass) -> force` is its tangent for implicit steps; one that is `definite` always pushes back.
+    One that jumps in time has `averaged_over_step(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
+    `near(t, state, mass) -> force` is its tangent for implicit steps; one that is `dissipative_symmetric` always pushes back.
     Its numbers are fields made with `quantity`; one that depends on g or on which axis is up asks the scene: `under`.
 
     Example:
@@ -99,7 +99,7 @@ class Contact(eqx.Module):
 
     Example:
         >>> floor = contacts.Plane(point=(0.0, 0.0), normal=(0.0, 1.0))
-        >>> isinstance(floor, Contact), float(floor.gap(0.0, ball.position))
+        >>> isinstance(floor, Contact), float(floor.signed_distance(0.0, ball.position))
         (True, 10.0)
     """
 
@@ -108,43 +108,43 @@ class Contact(eqx.Module):
     memory: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Signed distance to the surface [m], > 0 on the legal side."""
 
     @abstractmethod
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after a touch; lanes that touch nothing stay as they are."""
 
-    def forgetting(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
+    def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
         """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
         return self
 
-    def answered(self, t: ArrayLike, state: Any, mass: Any) -> Any:
+    def resolve(self, t: ArrayLike, state: Any, mass: Any) -> Any:
         """What `project` takes: `respond`, unless an answer needs the masses."""
         return self.respond(t, state)
 
     def clearance(self, t: ArrayLike, state: Any) -> Float[Array, "*lanes"]:
         """How far each lane is from touching [m]."""
-        return self.gap(t, state.position)
+        return self.signed_distance(t, state.position)
 
     def demand_fit(self, state: Any, mass: Any) -> None:
         """Raise a TypeError for what cannot touch it, and a ValueError for lanes that start on the wrong side."""
         demand_particles("contacts", state, "rigid bodies touch with rigid.Touch(hull, plane)")
-        demand_legal(self, state)
+        demand_start_outside(self, state)
 
-    def prepared(self, state: Any, couples: bool) -> "Contact":
+    def prepare(self, state: Any, couples: bool) -> "Contact":
         """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
         return self
 
 
-def changes(part: Any) -> Any:
+def build_memory_mask(part: Any) -> Any:
     """A part of a scene with True in place of each array that its `memory` names, False elsewhere."""
     mask = jax.tree.map(lambda _: False, part)
     where = lambda part: [getattr(part, name) for name in part.memory]  # noqa: E731
     return eqx.tree_at(where, mask, [True] * len(part.memory)) if getattr(part, "memory", ()) else mask
 
 
-def under_one_gravity(forces: list, dim: int) -> tuple:
+def unify_gravity(forces: list, dim: int) -> tuple:
     """The forces, agreed about g and which axis of `dim` is up: those of `Gravity`, of several the sum."""
     weights = [force.weight for force in forces if isinstance(force, Force) and force.weight is not None]
     for _, up in weights:
@@ -161,26 +161,26 @@ def under_one_gravity(forces: list, dim: int) -> tuple:
     return tuple(force.under(weight) if isinstance(force, Force) else force for force in forces)
 
 
-def listed(kind: str, parts: Any) -> tuple:
+def as_tuple(kind: str, parts: Any) -> tuple:
     """The parts as a tuple; a single one given without it is an easy slip and gets an error that says so."""
     if callable(parts) or not hasattr(parts, "__iter__"):
         raise TypeError(f"{kind}s: got {type(parts).__name__}, expected a tuple of {kind}s. Write {kind}s=({kind},).")
     return tuple(parts)
 
 
-def prepared_force(force: Any, dtype: np.dtype) -> eqx.Module:
+def prepare_force(force: Any, dtype: np.dtype) -> eqx.Module:
     """A force as a pytree of arrays in the scene's dtype; a TypeError for what is none."""
     expected = "a force: a callable (t, state, mass) -> newtons"
-    return _prepared("force", force, callable(force) and not isinstance(force, type), expected, dtype)
+    return _prepare_part("force", force, callable(force) and not isinstance(force, type), expected, dtype)
 
 
-def prepared_contact(contact: Any, dtype: np.dtype) -> eqx.Module:
+def prepare_contact(contact: Any, dtype: np.dtype) -> eqx.Module:
     """A contact as a pytree of arrays in the scene's dtype; a TypeError for what is none."""
     expected = "a contact, e.g. contacts.Plane(point=(0, 0), normal=(0, 1))"
-    return _prepared("contact", contact, isinstance(contact, Contact), expected, dtype)
+    return _prepare_part("contact", contact, isinstance(contact, Contact), expected, dtype)
 
 
-def _prepared(kind: str, part: Any, good: bool, expected: str, dtype: np.dtype) -> eqx.Module:
+def _prepare_part(kind: str, part: Any, good: bool, expected: str, dtype: np.dtype) -> eqx.Module:
     """A force or contact as a pytree of arrays whose floating-point numbers have the scene's dtype; a TypeError otherwise."""
     if not good:
         raise TypeError(f"{kind}s: got {type(part).__name__} {part!r}, expected {expected}.")

@@ -11,10 +11,10 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, declared
+from physjax.checks import concrete_or_none, unchecked_quantity
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
-from physjax.vectors import components, stacked
+from physjax.vectors import components, stack_components
 
 
 class Pins(eqx.Module):
@@ -25,16 +25,16 @@ class Pins(eqx.Module):
     that a method keeps its order where the path is smooth; after each step they stand on it exactly. `t` [s] is a
     scalar, or shaped to broadcast with the lanes where a run has many step sizes. Numbers of a path that is an
     `equinox.Module` can be swept and differentiated; a plain function compiles anew for each new one. Led lanes must
-    start on the path: `state = pins.lead(0.0, state)`. Raises ValueError or TypeError otherwise.
+    start on the path: `state = pins.prescribe(0.0, state)`. Raises ValueError or TypeError otherwise.
 
     Example:
         >>> hand = Pins(sheet.nodes["left"], path=lambda t: sheet.state.position + jnp.array([0.0, 2.0, 0.0]) * t)
-        >>> led = hand.lead(0.5, sheet.state)
-        >>> print(led.position[0], led.velocity[0])
+        >>> prescribed = hand.prescribe(0.5, sheet.state)
+        >>> print(prescribed.position[0], prescribed.velocity[0])
         [0. 1. 0.] [0. 2. 0.]
     """
 
-    nodes: Bool[Array, "*lanes"] = declared("prescribed nodes", per="memory")
+    nodes: Bool[Array, "*lanes"] = unchecked_quantity("prescribed nodes", per="memory")
     path: Callable
 
     def __init__(self, nodes: Any, path: Any):
@@ -49,22 +49,25 @@ class Pins(eqx.Module):
         self.nodes = nodes
         self.path = as_module(path)
 
-    def lead(self, t: ArrayLike, state: Particles) -> Particles:
+    def prescribe(self, t: ArrayLike, state: Particles) -> Particles:
         """The state with the led lanes where the path is at the time t [s], and as fast."""
         position, velocity = self._motion(t, state)
-        position, velocity = self._on_led(position, state.position), self._on_led(velocity, state.velocity)
+        position, velocity = (
+            self._replace_prescribed(position, state.position),
+            self._replace_prescribed(velocity, state.velocity),
+        )
         # kept apart: XLA on CPU would follow the path again for every neighbour that looks at a lane
         return state._replace(**lax.optimization_barrier({"position": position, "velocity": velocity}))
 
-    def drive(
+    def prescribe_acceleration(
         self, t: ArrayLike, state: Particles, acceleration: Float[Array, "*lanes dim"]
     ) -> Float[Array, "*lanes dim"]:
         """The accelerations [m/s²] with that of the path, its second derivative, where lanes are led."""
         t = self._clock(t, state)
-        _, bend = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
-        return self._on_led(bend, acceleration)
+        _, path_acceleration = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
+        return self._replace_prescribed(path_acceleration, acceleration)
 
-    def prepared(self, state: Any) -> "Pins":
+    def prepare(self, state: Any) -> "Pins":
         """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
         demand_particles("Pins", state, "bodies are held by a mask, or by a point of theirs, mass=inertia.about(point)")
         if self.nodes.shape != state.lanes:
@@ -87,7 +90,7 @@ class Pins(eqx.Module):
 
         def positions(t):
             value = jnp.asarray(self.path(t))
-            if not jnp.issubdtype(value.dtype, jnp.number) or not _fits(value.shape, shape):
+            if not jnp.issubdtype(value.dtype, jnp.number) or not _is_broadcastable(value.shape, shape):
                 raise ValueError(
                     f"Pins: the path returns {value.dtype} of shape {value.shape} for a time of shape {t.shape}, expected "
                     f"positions [m] of the shape {shape} or broadcastable to it: (*lanes, dim), as the state has."
@@ -97,13 +100,13 @@ class Pins(eqx.Module):
         position, velocity = jax.jvp(positions, (t,), (jnp.ones_like(t),))
         return jnp.broadcast_to(position, shape), jnp.broadcast_to(velocity, shape)
 
-    def _on_led(self, led: Array, free: Array) -> Array:
+    def _replace_prescribed(self, prescribed: Array, free: Array) -> Array:
         # by components: a choice between whole vectors takes half as long again
-        pairs = zip(components(led), components(free), strict=True)
-        return stacked([jnp.where(self.nodes, a, b) for a, b in pairs])
+        pairs = zip(components(prescribed), components(free), strict=True)
+        return stack_components([jnp.where(self.nodes, a, b) for a, b in pairs])
 
 
-def _fits(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
+def _is_broadcastable(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
     """Whether an array of one shape can be broadcast to another."""
     pairs = zip(shape[::-1], whole[::-1], strict=False)
     return len(shape) <= len(whole) and all(n in (1, wanted) for n, wanted in pairs)
@@ -112,8 +115,8 @@ def _fits(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
 def _demand_start(pins: Pins, state: Particles) -> None:
     """Raise a ValueError unless the path is finite at t = 0 and the led lanes start on it, but for rounding."""
     position, velocity = pins._motion(0.0, state)
-    nodes, x = concrete(pins.nodes), concrete(state.position)
-    position, velocity = concrete(position), concrete(velocity)
+    nodes, x = concrete_or_none(pins.nodes), concrete_or_none(state.position)
+    position, velocity = concrete_or_none(position), concrete_or_none(velocity)
     if nodes is None or position is None or velocity is None:
         return
     where = np.argwhere(nodes)
@@ -130,5 +133,5 @@ def _demand_start(pins: Pins, state: Particles) -> None:
     if far.any():
         raise ValueError(
             f"Pins: {far.sum()} of {far.size} led lanes do not start on the path: lane {where[far][0].tolist()} is at "
-            f"{x[nodes][far][0]}, path(0) is {position[nodes][far][0]} [m]. Start there: state = pins.lead(0.0, state)."
+            f"{x[nodes][far][0]}, path(0) is {position[nodes][far][0]} [m]. Start there: state = pins.prescribe(0.0, state)."
         )

@@ -23,7 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, real_array, real_quantity
+from physjax.checks import as_real_array, as_real_quantity, concrete_or_none
 from physjax.vectors import norm, square_root
 
 __all__ = [
@@ -42,10 +42,10 @@ __all__ = [
     "velocity",
 ]
 
-ROUNDING = 8
+EDGE_ROUNDINGS = 8
 """A target beyond reach by no more than so many roundings counts as being on the edge."""
 
-TURN = 2 * math.pi * (1 + 1e-6)
+FULL_TURN = 2 * math.pi * (1 + 1e-6)
 """A full turn [rad], in any precision: an angle beyond it was meant in degrees."""
 
 _UNITS = {"t": "s", "speed": "m/s", "angle": "rad", "g": "m/s²"}
@@ -100,7 +100,7 @@ def position(
         >>> print(projectile.position(1.0, speed=10.0, angle=0.0, height=4.9))
         [10.  0.]
     """
-    t, s, theta, y0, g = _numbers(t=t, speed=speed, angle=angle, height=height, g=g)
+    t, s, theta, y0, g = _check_numbers(t=t, speed=speed, angle=angle, height=height, g=g)
     return jnp.stack([s * jnp.cos(theta) * t, y0 + (s * jnp.sin(theta) - 0.5 * g * t) * t], axis=-1)
 
 
@@ -111,7 +111,7 @@ def velocity(t: ArrayLike, speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike =
         >>> print(projectile.velocity(1.0, speed=10.0, angle=0.0))
         [10.  -9.8]
     """
-    t, s, theta, g = _numbers(t=t, speed=speed, angle=angle, g=g)
+    t, s, theta, g = _check_numbers(t=t, speed=speed, angle=angle, g=g)
     return jnp.stack([s * jnp.cos(theta), s * jnp.sin(theta) - g * t], axis=-1)
 
 
@@ -124,7 +124,7 @@ def apex_time(speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike = 9.8) -> Floa
         >>> round(float(projectile.apex_time(9.8, np.deg2rad(90.0))), 3)
         1.0
     """
-    s, theta, g = _numbers(speed=speed, angle=angle, g=g)
+    s, theta, g = _check_numbers(speed=speed, angle=angle, g=g)
     return s * jnp.sin(theta) / g
 
 
@@ -137,7 +137,7 @@ def apex_height(
         >>> round(float(projectile.apex_height(14.0, np.deg2rad(90.0))), 3)
         10.0
     """
-    s, theta, y0, g = _numbers(speed=speed, angle=angle, height=height, g=g)
+    s, theta, y0, g = _check_numbers(speed=speed, angle=angle, height=height, g=g)
     return y0 + (s * jnp.sin(theta)) ** 2 / (2.0 * g)
 
 
@@ -157,7 +157,7 @@ def flight_time(
         >>> round(float(projectile.flight_time(9.8, np.deg2rad(90.0))), 3)
         2.0
     """
-    s, theta, y0, y, g = _numbers(speed=speed, angle=angle, height=height, target_height=target_height, g=g)
+    s, theta, y0, y, g = _check_numbers(speed=speed, angle=angle, height=height, target_height=target_height, g=g)
     return _later_crossing(s * jnp.sin(theta), y0, y, g)
 
 
@@ -177,7 +177,7 @@ def horizontal_range(
         >>> round(float(projectile.horizontal_range(14.0, np.deg2rad(45.0))), 3)
         20.0
     """
-    s, theta, y0, y, g = _numbers(speed=speed, angle=angle, height=height, target_height=target_height, g=g)
+    s, theta, y0, y, g = _check_numbers(speed=speed, angle=angle, height=height, target_height=target_height, g=g)
     return s * jnp.cos(theta) * _later_crossing(s * jnp.sin(theta), y0, y, g)
 
 
@@ -191,14 +191,14 @@ def angle_for_apex(apex_height: ArrayLike, speed: ArrayLike, *, height: ArrayLik
         >>> round(float(np.rad2deg(projectile.angle_for_apex(2.5, speed=14.0).angle)), 3)
         30.0
     """
-    h, s, y0, g = _numbers(apex_height=apex_height, speed=speed, height=height, g=g)
+    h, s, y0, g = _check_numbers(apex_height=apex_height, speed=speed, height=height, g=g)
     rising = 2.0 * g * (h - y0)  # v_y²
     heights = 2.0 * g * (jnp.abs(h) + jnp.abs(y0))  # and the size of what was subtracted
-    up, above = _root(rising, heights)
-    forward, fast_enough = _root(s * s - rising, s * s + heights)
+    up, above = _root_or_zero(rising, heights)
+    forward, fast_enough = _root_or_zero(s * s - rising, s * s + heights)
     ok = above & fast_enough
     theta = jnp.arctan2(jnp.where(ok, up, 0.0), jnp.where(ok, forward, 1.0))
-    return Aim(_or_nan(ok, theta), ok)
+    return Aim(_nan_unless(ok, theta), ok)
 
 
 def angles_for_range(distance: ArrayLike, speed: ArrayLike, *, g: ArrayLike = 9.8) -> Arcs:
@@ -211,11 +211,11 @@ def angles_for_range(distance: ArrayLike, speed: ArrayLike, *, g: ArrayLike = 9.
         >>> round(float(np.rad2deg(arcs.low)), 3), round(float(np.rad2deg(arcs.high)), 3)
         (15.0, 75.0)
     """
-    r, s, g = _numbers(distance=distance, speed=speed, g=g)
+    r, s, g = _check_numbers(distance=distance, speed=speed, g=g)
     sine = g * r / (s * s)
-    cosine, ok = _root((1.0 - sine) * (1.0 + sine), 1.0)
+    cosine, ok = _root_or_zero((1.0 - sine) * (1.0 + sine), 1.0)
     half = 0.5 * jnp.arctan2(jnp.where(ok, sine, 0.0), cosine)
-    return Arcs(_or_nan(ok, jnp.where(sine < 0, math.pi + half, half)), _or_nan(ok, 0.5 * math.pi - half), ok)
+    return Arcs(_nan_unless(ok, jnp.where(sine < 0, math.pi + half, half)), _nan_unless(ok, 0.5 * math.pi - half), ok)
 
 
 def angles_for_target(distance: ArrayLike, rise: ArrayLike, speed: ArrayLike, *, g: ArrayLike = 9.8) -> Arcs:
@@ -231,14 +231,14 @@ def angles_for_target(distance: ArrayLike, rise: ArrayLike, speed: ArrayLike, *,
         >>> print(projectile.position(10.0 / (14.0 * np.cos(arcs.low)), 14.0, arcs.low))
         [10.  5.]
     """
-    r, rise, s, g = _numbers(distance=distance, rise=rise, speed=speed, g=g)
+    r, rise, s, g = _check_numbers(distance=distance, rise=rise, speed=speed, g=g)
     a, b = g * r / (s * s), g * rise / (s * s)  # the formula divided by s²: a tanθ = 1 ± √(1 - 2b - a²)
-    root, ok = _root(1.0 - 2.0 * b - a * a, 1.0 + 2.0 * jnp.abs(b) + a * a)
+    root, ok = _root_or_zero(1.0 - 2.0 * b - a * a, 1.0 + 2.0 * jnp.abs(b) + a * a)
     a, b = jnp.where(ok, a, 1.0), jnp.where(ok, b, 0.0)
     here = (a == 0) & (b == 0)
     rises, runs = a * a + 2.0 * b, a * (1.0 + root)
     low = jnp.arctan2(jnp.where(here, a, rises), jnp.where(here, 1.0 + root, runs))
-    return Arcs(_or_nan(ok, low), _or_nan(ok, jnp.arctan2(1.0 + root, a)), ok)
+    return Arcs(_nan_unless(ok, low), _nan_unless(ok, jnp.arctan2(1.0 + root, a)), ok)
 
 
 def least_speed(distance: ArrayLike, rise: ArrayLike, *, g: ArrayLike = 9.8) -> LeastSpeed:
@@ -250,22 +250,22 @@ def least_speed(distance: ArrayLike, rise: ArrayLike, *, g: ArrayLike = 9.8) -> 
         >>> round(float(projectile.least_speed(20.0, 0.0).speed), 3)
         14.0
     """
-    r, rise, g = _numbers(distance=distance, rise=rise, g=g)
+    r, rise, g = _check_numbers(distance=distance, rise=rise, g=g)
     behind = r < 0
     r = jnp.where(behind, -r, r)  # not abs, whose derivative at 0 is 0
     away = norm(jnp.stack([r, rise], axis=-1))
     below = rise < 0
     square = jnp.where(below, r * r / jnp.where(below, away - rise, 1.0), away + rise)  # of which the one cancels
-    speed, _ = _root(g * square, 0.0)
+    speed, _ = _root_or_zero(g * square, 0.0)
     theta = 0.25 * math.pi + 0.5 * jnp.arctan2(rise, jnp.where((r == 0) & (rise == 0), 1.0, r))
     return LeastSpeed(speed, jnp.where(behind, math.pi - theta, theta))
 
 
-def _numbers(**given: ArrayLike) -> tuple[Array, ...]:
+def _check_numbers(**given: ArrayLike) -> tuple[Array, ...]:
     """The numbers as arrays of one shape, bad ones refused where they are concrete and NaN where they are traced."""
-    arrays = {name: _number(name, value) for name, value in given.items()}
+    arrays = {name: _check_number(name, value) for name, value in given.items()}
     if "angle" in arrays:
-        _warn_of_degrees(concrete(arrays["angle"]))
+        _warn_of_degrees(concrete_or_none(arrays["angle"]))
     try:
         return tuple(jnp.broadcast_arrays(*arrays.values()))  # a list in older versions
     except ValueError as error:
@@ -275,39 +275,39 @@ def _numbers(**given: ArrayLike) -> tuple[Array, ...]:
 
 def _warn_of_degrees(angle: np.ndarray | None) -> None:
     """Warn of an angle beyond a full turn, which is most often one in degrees."""
-    if angle is not None and np.any(np.abs(angle) > TURN):
+    if angle is not None and np.any(np.abs(angle) > FULL_TURN):
         worst = angle.flat[np.nanargmax(np.abs(angle))]
         words = f"angle [rad]: got {worst:g}, more than a full turn; expected radians. For degrees use np.deg2rad."
         warnings.warn(words, stacklevel=4)
 
 
-def _number(name: str, value: ArrayLike) -> Array:
+def _check_number(name: str, value: ArrayLike) -> Array:
     label = f"{name} [{_UNITS.get(name, 'm')}]"
     if name in ("angle", "t"):
-        return real_array(label, value)
+        return as_real_array(label, value)
     if name not in ("speed", "g"):
-        return real_quantity(label, value)
-    array = real_quantity(label, value, above=0)
-    return jnp.where(array > 0, array, jnp.nan) if concrete(array) is None else array
+        return as_real_quantity(label, value)
+    array = as_real_quantity(label, value, above=0)
+    return jnp.where(array > 0, array, jnp.nan) if concrete_or_none(array) is None else array
 
 
 def _later_crossing(v_y: Array, y0: Array, y: Array, g: Array) -> Array:
     """The later solution of y₀ + v_y t - ½gt² = y, NaN where it lies before the launch or nowhere."""
     fall = y0 - y
-    root, crosses = _root(v_y * v_y + 2.0 * g * fall, v_y * v_y + 2.0 * g * (jnp.abs(y0) + jnp.abs(y)))
+    root, crosses = _root_or_zero(v_y * v_y + 2.0 * g * fall, v_y * v_y + 2.0 * g * (jnp.abs(y0) + jnp.abs(y)))
     down = v_y < 0
     falling = 2.0 * fall / jnp.where(down, root - v_y, 1.0)  # the same root without cancellation
-    return _or_nan(crosses & ~(down & (fall < 0)), jnp.where(down, falling, (v_y + root) / g))
+    return _nan_unless(crosses & ~(down & (fall < 0)), jnp.where(down, falling, (v_y + root) / g))
 
 
-def _root(square: Array, scale: ArrayLike) -> tuple[Array, Array]:
+def _root_or_zero(square: Array, scale: ArrayLike) -> tuple[Array, Array]:
     """Its square root and whether it is real: negative only by rounding, measured against `scale`, is zero; else 1 stands in."""
-    slack = ROUNDING * float(jnp.finfo(square.dtype).eps) * scale
+    slack = EDGE_ROUNDINGS * float(jnp.finfo(square.dtype).eps) * scale
     real = square >= -slack
     return square_root(jnp.where(real, jnp.maximum(square, 0.0), 1.0)), real
 
 
-def _or_nan(ok: Array, value: Array) -> Array:
+def _nan_unless(ok: Array, value: Array) -> Array:
     return jnp.where(ok, value, jnp.nan)
 
 

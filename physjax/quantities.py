@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from physjax.checks import OWN_AXES, Quantity, starts_legally
+from physjax.checks import ENTRY_AXIS_COUNT, Quantity, starts_outside
 
 PER_LANE = ("lane", "table", "point")
 """What there may be one of for each lane, given by the user."""
@@ -34,20 +34,20 @@ class Number(NamedTuple):
         if self.quantity is None:
             # a record of ours is shaped like the lanes; a module that declares nothing shares what it holds
             return self.owner is None and np.shape(self.value)[: len(lanes)] == lanes
-        own = OWN_AXES[self.quantity.per] + len(self.quantity.axes(dim))
+        own = ENTRY_AXIS_COUNT[self.quantity.per] + len(self.quantity.axes(dim))
         entries = self.quantity.per in (*PER_LANE, "spring", "memory")
         return entries and np.ndim(self.value) > own and np.shape(self.value)[: len(lanes)] == lanes
 
 
-def numbers(tree: Any) -> tuple[list[Number], Any]:
+def collect_numbers(tree: Any) -> tuple[list[Number], Any]:
     """Every leaf of a tree of parts with its declaration, the innermost on the way to it; and the tree's structure."""
     leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
-    return [_number(tree, path, leaf) for path, leaf in leaves], structure
+    return [_find_declaration(tree, path, leaf) for path, leaf in leaves], structure
 
 
-def lane_mask(tree: Any, lanes: tuple[int, ...], dim: int) -> Any:
+def build_lane_mask(tree: Any, lanes: tuple[int, ...], dim: int) -> Any:
     """The tree with True in place of each array that has an entry for each of these lanes, False elsewhere."""
-    found, structure = numbers(tree)
+    found, structure = collect_numbers(tree)
     return structure.unflatten([number.has_lanes(lanes, dim) for number in found])
 
 
@@ -57,30 +57,30 @@ def may_hide_lanes(tree: Any, lanes: tuple[int, ...], dim: int) -> bool:
     Nobody can know whether that is a table or a number per lane, so such lanes must stay together. So must those with a
     number per lane that lacks some of the lanes' axes.
     """
-    return any(_may_hide(number, lanes, dim) for number in numbers(tree)[0])
+    return any(_may_hide(number, lanes, dim) for number in collect_numbers(tree)[0])
 
 
 def select_lanes(tree: Any, lanes: tuple[int, ...], dim: int, cut: Callable) -> Any:
     """The tree with `cut(array)` for every array that has an entry for each of these lanes."""
-    mask = lane_mask(tree, lanes, dim)
+    mask = build_lane_mask(tree, lanes, dim)
     return jax.tree.map(lambda leaf, has_lanes: cut(leaf) if has_lanes else leaf, tree, mask)
 
 
 def demand_fitting_numbers(part: Any, lanes: tuple[int, ...], dim: int) -> None:
     """Raise a ValueError for a number of a part that is neither one for all lanes nor one for each."""
-    for number in numbers(part)[0]:
+    for number in collect_numbers(part)[0]:
         quantity, shape = number.quantity, np.shape(number.value)
         if quantity is None or quantity.per not in PER_LANE:
             continue
         own = quantity.axes(dim)
-        table = OWN_AXES[quantity.per]
+        table = ENTRY_AXIS_COUNT[quantity.per]
         front = shape[: len(shape) - len(own) - table]
         fits = len(shape) >= len(own) + table and shape[len(shape) - len(own) :] == own and front in ((), lanes)
         if not fits:
-            raise ValueError(_misfit(number, lanes, dim))
+            raise ValueError(_format_misfit(number, lanes, dim))
 
 
-def good_lanes(part: Any, lanes: tuple[int, ...], dim: int) -> list[Bool[Array, "..."]]:
+def find_valid_lanes(part: Any, lanes: tuple[int, ...], dim: int) -> list[Bool[Array, "..."]]:
     """For each traced number of a part, which lanes have it within its bounds, shaped () or like the lanes.
 
     A module may add relations between its numbers: `relations()` gives booleans, one for all lanes or one per lane.
@@ -88,17 +88,19 @@ def good_lanes(part: Any, lanes: tuple[int, ...], dim: int) -> list[Bool[Array, 
     if not any(map(_is_traced, jax.tree.leaves(part))):
         return []
     good = []
-    for number in numbers(part)[0]:
+    for number in collect_numbers(part)[0]:
         if number.quantity is not None and number.quantity.per != "memory" and _is_traced(number.value):
             per_lane = number.quantity.per in PER_LANE and number.has_lanes(lanes, dim)
-            good.append(_every_lane(number.quantity.within_bounds(number.value), lanes if per_lane else ()))
-    for module in _modules(part):
+            good.append(_all_entries_good(number.quantity.within_bounds(number.value), lanes if per_lane else ()))
+    for module in _iterate_modules(part):
         relations = module.relations() if hasattr(module, "relations") else ()
-        good += [_every_lane(r, lanes if r.shape[: len(lanes)] == lanes else ()) for r in relations if _is_traced(r)]
+        good += [
+            _all_entries_good(r, lanes if r.shape[: len(lanes)] == lanes else ()) for r in relations if _is_traced(r)
+        ]
     return good
 
 
-def _every_lane(good: Array, lanes: tuple[int, ...]) -> Array:
+def _all_entries_good(good: Array, lanes: tuple[int, ...]) -> Array:
     """Whether all entries of each lane are good."""
     return jnp.all(good, axis=tuple(range(len(lanes), good.ndim)))
 
@@ -107,16 +109,16 @@ def _is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
-def spoilt(state: Any, mass: Any, parts: Iterable[Any], contacts: Iterable[Any]) -> Any:
+def mark_invalid_lanes(state: Any, mass: Any, parts: Iterable[Any], contacts: Iterable[Any]) -> Any:
     """The state with NaN in the lanes that a traced number beyond its bounds spoils, or that start on the wrong side.
 
     A traced value cannot raise; so it is seen in the status of its lane, before the first step.
     """
     lanes, dim = state.lanes, state.position.shape[-1]
-    good = [flag for part in (mass, *parts) for flag in good_lanes(part, lanes, dim)]
+    good = [flag for part in (mass, *parts) for flag in find_valid_lanes(part, lanes, dim)]
     if _is_traced(mass):
         good.append(MASS.within_bounds(mass))
-    good += [flag for contact in contacts if _is_traced(flag := starts_legally(contact, state))]
+    good += [flag for contact in contacts if _is_traced(flag := starts_outside(contact, state))]
     if not good:
         return state
     every = good[0]
@@ -135,16 +137,16 @@ MASS = Quantity("mass", "kg", above=0.0)
 """What the mass of particles is."""
 
 
-def _modules(part: Any) -> Iterator[eqx.Module]:
+def _iterate_modules(part: Any) -> Iterator[eqx.Module]:
     """The modules that a part is made of, itself included."""
     if isinstance(part, eqx.Module):
         yield part
     for child in jax.tree.leaves(part, is_leaf=lambda node: node is not part):
         if child is not part and isinstance(child, eqx.Module | tuple | list | dict):
-            yield from _modules(child)
+            yield from _iterate_modules(child)
 
 
-def _number(tree: Any, path: tuple, leaf: Any) -> Number:
+def _find_declaration(tree: Any, path: tuple, leaf: Any) -> Number:
     """A leaf with the innermost declaration on the path to it; modules that a scene is built of own what they hold."""
     node, owner, field, quantity = tree, None, "", None
     for key in path:
@@ -155,11 +157,11 @@ def _number(tree: Any, path: tuple, leaf: Any) -> Number:
         elif about is not None:
             owner, field = node, name
             quantity = about.metadata.get("quantity", quantity)
-        node = _child(node, key)
+        node = _get_child(node, key)
     return Number(owner, field, quantity, leaf)
 
 
-def _child(node: Any, key: Any) -> Any:
+def _get_child(node: Any, key: Any) -> Any:
     """What a key of a path leads to; None within containers of another kind, in which nothing declares anything."""
     if isinstance(key, jax.tree_util.GetAttrKey):
         return getattr(node, key.name, None)
@@ -177,10 +179,10 @@ def _may_hide(number: Number, lanes: tuple[int, ...], dim: int) -> bool:
     return number.quantity.per in ("lane", "memory") and len(shape) > len(number.quantity.axes(dim))
 
 
-def _misfit(number: Number, lanes: tuple[int, ...], dim: int) -> str:
+def _format_misfit(number: Number, lanes: tuple[int, ...], dim: int) -> str:
     quantity, shape = number.quantity, np.shape(number.value)
     own = quantity.axes(dim)
-    if OWN_AXES[quantity.per]:
+    if ENTRY_AXIS_COUNT[quantity.per]:
         own = ("n", *own)
     text = lambda axes: "(" + ", ".join(map(str, axes)) + ("," if len(axes) == 1 else "") + ")"  # noqa: E731
     each = f" or {text((*lanes, *own))}, one for each lane" if lanes else ""
@@ -190,11 +192,11 @@ def _misfit(number: Number, lanes: tuple[int, ...], dim: int) -> str:
     advice = f" {hint(shape)}" if hint is not None else ""
     return (
         f"{type(number.owner).__name__}: {quantity.name} [{quantity.unit}] has the shape {shape}, expected {expected}."
-        f"{advice or _advice(shape, lanes, own)}"
+        f"{advice or _suggest_fix(shape, lanes, own)}"
     )
 
 
-def _advice(shape: tuple[int, ...], lanes: tuple[int, ...], own: tuple) -> str:
+def _suggest_fix(shape: tuple[int, ...], lanes: tuple[int, ...], own: tuple) -> str:
     if lanes and shape and len(shape) < len(lanes) and not own:
         return " Say which axis is meant: number[:, None] or number[None, :], broadcast to the lanes' shape."
     if not lanes and shape:

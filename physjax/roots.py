@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from physjax.backend import any_lane, apart, loop
+from physjax.backend import any_lane, bounded_while_loop, materialise_where
 
 
-def first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
+def find_first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
     """A root x of `function(x, *arguments)` per lane, which moves with all that the function depends on: dx = -∂f/(∂f/∂x).
 
     `search` holds the bracket, a guess of the values at its ends (positive at the first, negative at the last), which
@@ -18,25 +18,25 @@ def first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
     """
     # a force of the user's may close over a number that is being differentiated
     function, closed_over = jax.closure_convert(function, search[0][0], *arguments)
-    return _first_root(function, (*arguments, *closed_over), search)
+    return _find_first_root(function, (*arguments, *closed_over), search)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
-    return _bracketed_root(lambda x: function(x, *arguments), *search)
+def _find_first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
+    return _find_bracketed_root(lambda x: function(x, *arguments), *search)
 
 
-@_first_root.defjvp
-def _first_root_jvp(function, primals, tangents):
+@_find_first_root.defjvp
+def _find_first_root_jvp(function, primals, tangents):
     (arguments, search), (moves, _) = primals, tangents
-    x = _first_root(function, arguments, search)
+    x = _find_first_root(function, arguments, search)
     _, shift = jax.jvp(lambda *arguments: function(x, *arguments), arguments, moves)
     _, slope = jax.jvp(lambda x: function(x, *arguments), (x,), (jnp.ones_like(x),))
     falls = search[2] & (slope < 0)
     return x, jnp.where(falls, shift, 0.0) / jnp.where(falls, -slope, 1.0)
 
 
-def _bracketed_root(
+def _find_bracketed_root(
     function: Callable, bracket: tuple[Array, Array], values: tuple[Array, Array], active: Array, tolerance: Array
 ) -> Array:
     """Chandrupatla's method: inverse quadratic interpolation where it is safe, else bisection.
@@ -53,7 +53,7 @@ def _bracketed_root(
     def closer(carry):
         a, b, fa, fb, share, going = carry
         x = a + share * (b - a)
-        fx = apart(going, lambda: function(x), x)
+        fx = materialise_where(going, lambda: function(x), x)
         same = (fx < 0) == (fa < 0)
         c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
         b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
@@ -67,4 +67,4 @@ def _bracketed_root(
         return tuple(jnp.where(going, new, old) for new, old in zip(after, carry, strict=True))
 
     start = (high, low, below, above, below / (below - above), active & (high > low))
-    return loop(going, closer, start, most=200)[0]
+    return bounded_while_loop(going, closer, start, most=200)[0]

@@ -17,23 +17,31 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import WHOLE, kept_apart
-from physjax.loops import RECORD, Time, at_now, is_ours, now, told, told_method
-from physjax.particles import Particles, added, shaped
+from physjax.backend import SINGLE_PIECE_NODES, materialise
+from physjax.loops import (
+    RECORD,
+    Time,
+    is_library_part,
+    respond_at_float_time,
+    time_for_method,
+    time_for_part,
+    to_float_time,
+)
+from physjax.particles import Particles, check_load_shape, sum_terms
 from physjax.parts import (
     Contact,
     Field,
     Force,
     Function,
     as_module,
-    changes,
-    listed,
-    plain_functions,
-    prepared_contact,
-    prepared_force,
-    under_one_gravity,
+    as_tuple,
+    build_memory_mask,
+    find_plain_functions,
+    prepare_contact,
+    prepare_force,
+    unify_gravity,
 )
-from physjax.quantities import demand_fitting_numbers, lane_mask, may_hide_lanes, spoilt
+from physjax.quantities import build_lane_mask, demand_fitting_numbers, mark_invalid_lanes, may_hide_lanes
 from physjax.vectors import scale
 
 
@@ -54,8 +62,8 @@ def project(motion: Callable, scene: "Scene", t: Time, dt: Time) -> "Scene":
     state = scene.state
     for contact in scene.contacts:
         if (contact.response or project) is project:
-            state = contact.answered(now(t + dt), state, scene.mass)
-    return scene.having(state=state)
+            state = contact.resolve(to_float_time(t + dt), state, scene.mass)
+    return scene.replace(state=state)
 
 
 class Scene(eqx.Module):
@@ -91,36 +99,38 @@ class Scene(eqx.Module):
         pinned: Any = None,
         emitter: Any = None,
     ):
-        if not hasattr(state, "checked"):
+        if not hasattr(state, "validate"):
             raise TypeError(
                 f"Scene: got a state of type {type(state).__name__}, expected Particles(position, velocity), "
                 "or RigidBodies(position, orientation, momentum, angular_momentum)."
             )
-        state, mass = state.checked(mass)
+        state, mass = state.validate(mass)
         lanes, dtype = state.lanes, state.dtype
-        if hasattr(pinned, "lead"):
-            pinned = pinned.prepared(state)
-            state = pinned.lead(0.0, state)
+        if hasattr(pinned, "prescribe"):
+            pinned = pinned.prepare(state)
+            state = pinned.prescribe(0.0, state)
         elif pinned is not None:
             pinned = jnp.asarray(pinned)
             if pinned.dtype != bool or pinned.shape != lanes:
                 raise ValueError(
                     f"pinned: got {pinned.dtype} of shape {pinned.shape}, expected booleans of the lanes' shape {lanes}."
                 )
-            state = state.held(1 - pinned.astype(dtype))
+            state = state.hold_lanes(1 - pinned.astype(dtype))
         self.mass = mass
-        forces = [prepared_force(force, dtype) for force in listed("force", forces)]
-        self.forces = under_one_gravity(forces, state.position.shape[-1])
-        self.contacts = tuple(prepared_contact(contact, dtype) for contact in listed("contact", contacts))
+        forces = [prepare_force(force, dtype) for force in as_tuple("force", forces)]
+        self.forces = unify_gravity(forces, state.position.shape[-1])
+        self.contacts = tuple(prepare_contact(contact, dtype) for contact in as_tuple("contact", contacts))
         for part in (*self.forces, *self.contacts):
             demand_fitting_numbers(part, lanes, state.position.shape[-1])
         for contact in self.contacts:
             contact.demand_fit(state, mass)
-        self.state = state = spoilt(state, mass, (*self.forces, *self.contacts, pinned, emitter), self.contacts)
-        self.contacts = tuple(contact.prepared(state, self.couples) for contact in self.contacts)
+        self.state = state = mark_invalid_lanes(
+            state, mass, (*self.forces, *self.contacts, pinned, emitter), self.contacts
+        )
+        self.contacts = tuple(contact.prepare(state, self.couples) for contact in self.contacts)
         self.pinned = pinned
         self.reaction = None
-        self.emitter = None if emitter is None else emitter.prepared(self)
+        self.emitter = None if emitter is None else emitter.prepare(self)
 
     @property
     def couples(self) -> bool:
@@ -137,29 +147,29 @@ class Scene(eqx.Module):
     @property
     def held(self) -> Bool[Array, "*lanes"] | None:
         """Mask of the lanes that no force moves, held where they are or led along a path; None where there are none."""
-        return self.pinned if self.led is None else self.led.nodes
+        return self.pinned if self.prescribed_motion is None else self.prescribed_motion.nodes
 
     @property
-    def led(self) -> Any:
+    def prescribed_motion(self) -> Any:
         """The `Pins` that lead lanes along a path; None without."""
-        return self.pinned if hasattr(self.pinned, "lead") else None
+        return self.pinned if hasattr(self.pinned, "prescribe") else None
 
     @property
-    def in_pieces(self) -> bool:
+    def compiles_in_pieces(self) -> bool:
         """Whether a step is compiled in pieces: where more than a few nodes look at each other."""
-        return self.couples and self.state.lanes[-1:] > (WHOLE,)
+        return self.couples and self.state.lanes[-1:] > (SINGLE_PIECE_NODES,)
 
     def may_be_cut(self) -> bool:
         """Whether some lanes can be stepped without the rest: independent ones, and no part may hide an array of all lanes.
 
         A plain function may close over one, a path has one, and so may a part whose arrays are not declared.
         """
-        whole = self.couples or self.led is not None or bool(plain_functions(self.forces))
+        whole = self.couples or self.prescribed_motion is not None or bool(find_plain_functions(self.forces))
         return not whole and not may_hide_lanes(self, self.state.lanes, self.state.position.shape[-1])
 
-    def lane_mask(self, tree: Any) -> Any:
+    def build_lane_mask(self, tree: Any) -> Any:
         """The tree with True in place of each array that has an entry for each lane of this scene, False elsewhere."""
-        return lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
+        return build_lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
 
     @property
     def remembers(self) -> bool:
@@ -178,28 +188,30 @@ class Scene(eqx.Module):
 
     def acceleration(self, t: Time, state: Particles) -> Float[Array, "*lanes dim"]:
         """Newton's second law, a = ΣF/m [m/s²]; held lanes do not accelerate, led ones as their path does."""
-        if self.led is not None:
-            state = self.led.lead(now(t), state)
+        if self.prescribed_motion is not None:
+            state = self.prescribed_motion.prescribe(to_float_time(t), state)
         free = None if self.held is None else 1 - self.held.astype(state.dtype)
         fields = [f for f in self.forces if isinstance(f, Field)]
-        fields = [shaped(f, f.acceleration(told(f, t), state, self.mass), state.velocity) for f in fields]
-        newtons = [state.load(f, t, self.mass) for f in self.forces if not isinstance(f, Field)]
+        fields = [
+            check_load_shape(f, f.acceleration(time_for_part(f, t), state, self.mass), state.velocity) for f in fields
+        ]
+        newtons = [state.evaluate_load(f, t, self.mass) for f in self.forces if not isinstance(f, Field)]
         total = []
         if fields:
-            total.append(added(fields) if free is None else scale(free, added(fields)))
+            total.append(sum_terms(fields) if free is None else scale(free, sum_terms(fields)))
         if newtons:
-            total.append(scale((1.0 if free is None else free) / self.mass, added(newtons)))
-        acceleration = added(total) if total else jnp.zeros_like(state.velocity)
-        if self.led is not None:
-            acceleration = self.led.drive(now(t), state, acceleration)
-        return acceleration if self.reaction is None else self.reaction(now(t), state, acceleration)
+            total.append(scale((1.0 if free is None else free) / self.mass, sum_terms(newtons)))
+        acceleration = sum_terms(total) if total else jnp.zeros_like(state.velocity)
+        if self.prescribed_motion is not None:
+            acceleration = self.prescribed_motion.prescribe_acceleration(to_float_time(t), state, acceleration)
+        return acceleration if self.reaction is None else self.reaction(to_float_time(t), state, acceleration)
 
     def rate(self, t: Time, state: Any) -> Any:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
-        if not self.in_pieces:
-            return state.rate(state.driven(self, t), self.mass)
+        if not self.compiles_in_pieces:
+            return state.rate(state.generalised_force(self, t), self.mass)
         # apart, or a method's stage would be computed anew in every neighbour that looks at it
-        return state.rate(kept_apart(now(t), lambda: state.driven(self, t)), self.mass)
+        return state.rate(materialise(to_float_time(t), lambda: state.generalised_force(self, t)), self.mass)
 
     def kick(self, state: Any, rate: Any, dt: ArrayLike) -> Any:
         """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""
@@ -209,27 +221,34 @@ class Scene(eqx.Module):
         """Positions (of bodies also orientations) moved by the velocities in `state` for a time dt."""
         return state.drift(dt, self.mass)
 
-    def settled(self, state: Any) -> Any:
+    def normalised(self, state: Any) -> Any:
         """The state as it must be after a step, where its arrays have to agree with each other."""
-        return state.settled(self.mass) if hasattr(state, "settled") else state
+        return state.normalised(self.mass) if hasattr(state, "normalised") else state
 
-    def during(self, t: Time, dt: ArrayLike) -> "Scene":
+    def averaged_over_step(self, t: Time, dt: ArrayLike) -> "Scene":
         """The scene as one step sees it: forces that jump in time replaced by their mean over the step."""
-        see = lambda f: self.state.shown_to(f, self.mass)[0]  # noqa: E731
-        forces = tuple(f.during(told(f, t), dt, see(f)) if hasattr(f, "during") else f for f in self.forces)
+        see = lambda f: self.state.view_for_force(f, self.mass)[0]  # noqa: E731
+        forces = tuple(
+            f.averaged_over_step(time_for_part(f, t), dt, see(f)) if hasattr(f, "averaged_over_step") else f
+            for f in self.forces
+        )
         return eqx.tree_at(lambda scene: scene.forces, self, forces)
 
     @property
-    def definite(self) -> bool:
+    def dissipative_symmetric(self) -> bool:
         """Whether every force pushes back, symmetrically: an implicit step may then use conjugate gradients."""
-        flat = not hasattr(self.state, "settled")  # what turns pushes back in no symmetric way
-        return flat and all(getattr(force, "definite", False) for force in self.forces)
+        flat = not hasattr(self.state, "normalised")  # what turns pushes back in no symmetric way
+        return flat and all(getattr(force, "dissipative_symmetric", False) for force in self.forces)
 
-    def near(self, t: Time, state: Any) -> "Scene":
+    def linearised_at(self, t: Time, state: Any) -> "Scene":
         """The scene as an implicit step sees it: forces that have a tangent at this state replaced by it."""
-        state = state if self.led is None else self.led.lead(now(t), state)
-        see = lambda f: state.shown_to(f, self.mass)  # noqa: E731
-        return self.having(forces=tuple(f.near(told(f, t), *see(f)) if hasattr(f, "near") else f for f in self.forces))
+        state = state if self.prescribed_motion is None else self.prescribed_motion.prescribe(to_float_time(t), state)
+        see = lambda f: state.view_for_force(f, self.mass)  # noqa: E731
+        return self.replace(
+            forces=tuple(
+                f.linearised_at(time_for_part(f, t), *see(f)) if hasattr(f, "linearised_at") else f for f in self.forces
+            )
+        )
 
     def step(self, method: Callable, t: Time, dt: ArrayLike) -> "Scene":
         """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
@@ -237,27 +256,31 @@ class Scene(eqx.Module):
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is answered at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
-            motion = Partial(response, motion) if is_ours(response) else Partial(at_now, as_module(response), motion)
+            motion = (
+                Partial(response, motion)
+                if is_library_part(response)
+                else Partial(respond_at_float_time, as_module(response), motion)
+            )
         after = motion(self, t, dt) if self.emitter is None else self.emitter.live(motion, self, t, dt)
         state = after.state
-        if self.led is not None:
-            state = self.led.lead(now(t + dt), state)
+        if self.prescribed_motion is not None:
+            state = self.prescribed_motion.prescribe(to_float_time(t + dt), state)
         elif self.contacts and self.pinned is not None:
             held = self.pinned[..., None]
             state = jax.tree.map(lambda now, before: jnp.where(held, before, now), state, self.state)
-        return after.having(state=state).advanced(now(t), dt)
+        return after.replace(state=state).advance_memory(to_float_time(t), dt)
 
-    def advanced(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
+    def advance_memory(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
         """The scene after each force that remembers has advanced by a step from t to t + dt."""
         forces, state = list(self.forces), self.state
         for i, force in enumerate(forces):
             if hasattr(force, "advance"):
-                seen, _ = state.shown_to(force, self.mass)
+                seen, _ = state.view_for_force(force, self.mass)
                 forces[i], after = force.advance(t, dt, seen)
                 state = after if seen is state else state
-        return self.having(state=state, forces=tuple(forces))
+        return self.replace(state=state, forces=tuple(forces))
 
-    def having(self, **parts: Any) -> "Scene":
+    def replace(self, **parts: Any) -> "Scene":
         """The scene with some of its parts replaced, unchecked."""
         names = list(parts)
         where = lambda scene: [getattr(scene, name) for name in names]  # noqa: E731
@@ -270,7 +293,7 @@ class Scene(eqx.Module):
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
 
 
-def traced_once(response: Callable) -> Callable:
+def trace_once(response: Callable) -> Callable:
     """A response traced once for all who step the same scene: a search with derivatives steps it in many places."""
     program = jax.jit(response)
 
@@ -283,8 +306,8 @@ def traced_once(response: Callable) -> Callable:
 
 def free_motion(method: Callable, scene: Scene, t: Time, dt: Time) -> Scene:
     """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
-    seen = method.checked(scene) if hasattr(method, "checked") else scene.during(t, dt)
-    return scene.having(state=scene.settled(method(seen, told_method(method, t), scene.state, dt)))
+    seen = method.check_scene(scene) if hasattr(method, "check_scene") else scene.averaged_over_step(t, dt)
+    return scene.replace(state=scene.normalised(method(seen, time_for_method(method, t), scene.state, dt)))
 
 
 def loads(scene: Scene, t: Time, state: Any = None, *, per_term: bool = False) -> Any:
@@ -298,8 +321,8 @@ def loads(scene: Scene, t: Time, state: Any = None, *, per_term: bool = False) -
         [5.  0.4]
     """
     state = scene.state if state is None else state
-    terms = tuple(state.load(force, t, scene.mass) for force in scene.forces)
-    return terms if per_term else state.total(terms)
+    terms = tuple(state.evaluate_load(force, t, scene.mass) for force in scene.forces)
+    return terms if per_term else state.sum_loads(terms)
 
 
 __all__ = [
@@ -310,10 +333,10 @@ __all__ = [
     "Particles",
     "Scene",
     "as_module",
-    "changes",
+    "build_memory_mask",
+    "find_plain_functions",
     "free_motion",
     "loads",
-    "plain_functions",
     "project",
-    "traced_once",
+    "trace_once",
 ]

@@ -7,7 +7,7 @@ from physjax.quantities import select_lanes
 from physjax.scene import Scene
 
 
-def one_lane(scene: Scene, lane: int | tuple[int, ...]) -> Scene:
+def select_lane(scene: Scene, lane: int | tuple[int, ...]) -> Scene:
     """A single lane of a scene of independent ones, or a single scene of many coupled ones, by its index.
 
     What a plain function holds nobody can see, so it stays as it is. Raises IndexError where there is no such lane.
@@ -17,10 +17,10 @@ def one_lane(scene: Scene, lane: int | tuple[int, ...]) -> Scene:
     if len(index) != len(shape) or any(not 0 <= i < n for i, n in zip(index, shape, strict=True)):
         what = "scenes" if scene.couples else "lanes"
         raise IndexError(f"lane: got {lane}, expected an index into the {what}, whose shape is {shape}.")
-    return with_lanes(scene, shape, lambda leaf: leaf[index])
+    return cut_lanes(scene, shape, lambda leaf: leaf[index])
 
 
-def with_lanes(scene: Scene, shape: tuple[int, ...], cut: Callable) -> Scene:
+def cut_lanes(scene: Scene, shape: tuple[int, ...], cut: Callable) -> Scene:
     """The scene with `cut(array)` for every array that has an entry for each of lanes of this shape."""
     if scene.emitter is not None:
         raise ValueError(

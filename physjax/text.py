@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 
-def table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str | None = None) -> str:
+def format_table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str | None = None) -> str:
     """Columns aligned by `align`, a `<` or `>` for each; the first to the left and the others to the right by default."""
     align = align or "<" + ">" * (len(headers) - 1)
     widths = [max(len(str(row[i])) for row in (headers, *rows)) for i in range(len(headers))]
@@ -30,7 +30,7 @@ def progress_bar(items: Any = None, *, progress: bool = True, **options: Any) ->
     return tqdm(items, file=stream, disable=not progress, **options)
 
 
-def seconds_text(seconds: int | float) -> str:
+def format_seconds(seconds: int | float) -> str:
     """A time with a unit that keeps it readable, from µs to days."""
     for unit, size in (("d", 86400.0), ("s", 1.0), ("ms", 1e-3)):
         if float(f"{seconds / size:.3g}") >= 1:  # as it is printed
@@ -38,7 +38,7 @@ def seconds_text(seconds: int | float) -> str:
     return f"{seconds / 1e-6:.3g} µs"
 
 
-def machine() -> str:
+def describe_machine() -> str:
     """One line about where numbers were measured: device, processor, versions."""
     device = jax.devices()[0]
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "diffrax", "numpy"))

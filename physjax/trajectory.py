@@ -11,12 +11,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.checks import concrete
-from physjax.crossing import Crossing, first_crossing
-from physjax.files import RUN_FORMAT, demand_run, read_arrays, replacing
+from physjax.checks import concrete_or_none
+from physjax.crossing import Crossing, find_first_crossing
+from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
 from physjax.loops import moment_at
 from physjax.particles import Particles
-from physjax.parts import Contact, Function, as_module, changes
+from physjax.parts import Contact, Function, as_module, build_memory_mask
 from physjax.scene import Scene
 
 
@@ -54,7 +54,7 @@ class Trajectory(eqx.Module):
             >>> print(flight.position[10])
             [3.  9.1]
         """
-        return self._states().position
+        return self._demand_states().position
 
     @property
     def velocity(self) -> Float[Array | np.ndarray, "frames *lanes dim"]:
@@ -64,8 +64,10 @@ class Trajectory(eqx.Module):
             >>> print(flight.velocity[10])
             [ 3.  -5.8]
         """
-        states = self._states()
-        return states.velocity if hasattr(states, "velocity") else states.shown_to(None, self.scene.mass)[0].velocity
+        states = self._demand_states()
+        return (
+            states.velocity if hasattr(states, "velocity") else states.view_for_force(None, self.scene.mass)[0].velocity
+        )
 
     @property
     def method(self) -> Any:
@@ -101,11 +103,11 @@ class Trajectory(eqx.Module):
             >>> int(flight.first_bad_step)
             -1
         """
-        ok = concrete(self.ok)
+        ok = concrete_or_none(self.ok)
         if ok is not None and ok.all():
             return jnp.full(ok.shape, -1, jnp.int32)
-        self._known_scene("first_bad_step")
-        watch = partial(_first_bad_step, steps=self.steps)
+        self._demand_scene("first_bad_step")
+        watch = partial(_find_first_bad_step, steps=self.steps)
         for _ in range(self.first_step.ndim):  # runs that came out of vmap
             watch = jax.vmap(watch)
         return watch(self.scene, self.stepper, self.dt, self.first_step)
@@ -118,13 +120,13 @@ class Trajectory(eqx.Module):
             >>> flight.film.state.position.shape
             (21, 2)
         """
-        return _remembering(self._known_scene("film"), self._states(), self.parts)
+        return _replace_memories(self._demand_scene("film"), self._demand_states(), self.parts)
 
     def __repr__(self) -> str:
         """One line: what was run, for how long, and whether it held."""
         method = self.method
         how = "" if method is None else f"{getattr(method, '__name__', type(method).__name__)}, "
-        if concrete(self.time) is None or np.ndim(self.first_step):
+        if concrete_or_none(self.time) is None or np.ndim(self.first_step):
             return f"<Trajectory: {how}{self.steps} steps, traced or out of vmap>"
         time, ok = np.asarray(self.time), np.asarray(self.ok)
         shape = "recorded" if self.state is None else f"position {self.position.shape} {self.position.dtype}"
@@ -150,8 +152,8 @@ class Trajectory(eqx.Module):
             >>> round(float(landing.time), 3), round((4.0 + (4.0**2 + 2 * 9.8 * 10.0) ** 0.5) / 9.8, 3)
             (1.894, 1.894)
         """
-        self._known_scene("crossing")
-        return first_crossing(self, surface, direction)
+        self._demand_scene("crossing")
+        return find_first_crossing(self, surface, direction)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the run as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent.
@@ -165,15 +167,15 @@ class Trajectory(eqx.Module):
             (21,)
         """
         arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
-        arrays |= {"method": _method_name(self.method), "format": RUN_FORMAT}
+        arrays |= {"method": _get_method_name(self.method), "format": RUN_FORMAT}
         if self.dt is not None:
             arrays["dt"] = self.dt
         if self.scene is not None and self.stepper is not None:
             arrays["first_bad_step"] = self.first_bad_step
-        for group, tree in self._saved().items():
+        for group, tree in self._collect_saved_trees().items():
             for keys, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 arrays[group + jax.tree_util.keystr(keys)] = leaf
-        with replacing(path, "wb") as file:
+        with write_atomically(path, "wb") as file:
             np.savez_compressed(file, **{name: np.asarray(array) for name, array in arrays.items()})
 
     @classmethod
@@ -194,17 +196,17 @@ class Trajectory(eqx.Module):
             True
         """
         arrays = read_arrays(path, "a run written by Trajectory.save")
-        demand_run(path, arrays)
-        return _restored(cls, arrays, scene, method)
+        demand_saved_run(path, arrays)
+        return _restore_run(cls, arrays, scene, method)
 
-    def _saved(self) -> dict[str, Any]:
+    def _collect_saved_trees(self) -> dict[str, Any]:
         """The pytrees that go into a file, by the name they have there."""
         groups = {"state": self.state, "parts": self.parts, "recorded": self.recorded}
         if self.final_scene is not None:
-            groups |= {"final_state": self.final_scene.state, "final_parts": memories(self.final_scene)}
+            groups |= {"final_state": self.final_scene.state, "final_parts": select_stateful_parts(self.final_scene)}
         return groups
 
-    def _known_scene(self, what: str) -> Scene:
+    def _demand_scene(self, what: str) -> Scene:
         """The scene, if it is known with its method, so that it can be stepped."""
         if self.scene is None or self.stepper is None:
             raise ValueError(
@@ -212,7 +214,7 @@ class Trajectory(eqx.Module):
             )
         return self.scene
 
-    def _states(self) -> Any:
+    def _demand_states(self) -> Any:
         if self.state is None:
             raise AttributeError(
                 "this trajectory holds .recorded only: simulate was told what to record instead of the state."
@@ -221,7 +223,7 @@ class Trajectory(eqx.Module):
 
 
 @partial(jax.jit, static_argnames="steps")
-def _first_bad_step(scene, method, dt, first_step, steps):
+def _find_first_bad_step(scene, method, dt, first_step, steps):
     def body(carry):
         i, scene, found = carry
         scene = scene.step(method, moment_at(first_step + i, dt, scene.state.dtype), dt)
@@ -236,37 +238,37 @@ def _first_bad_step(scene, method, dt, first_step, steps):
     return lax.while_loop(going, body, (jnp.zeros((), jnp.int32), scene, bad))[2]
 
 
-def memories(scene: Scene) -> tuple:
+def select_stateful_parts(scene: Scene) -> tuple:
     """Those of the scene's parts that remember: forces that advance, contacts that know who touches them, an emitter."""
-    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if _remembers(part))
+    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if _has_memory(part))
 
 
-def _remembering(scene: Scene, state: Any, parts: tuple) -> Scene:
+def _replace_memories(scene: Scene, state: Any, parts: tuple) -> Scene:
     """The scene with another state, and with other memories in those of its parts that have some."""
     parts = iter(parts)
-    renewed = lambda old: tuple(next(parts) if _remembers(part) else part for part in old)  # noqa: E731
+    renewed = lambda old: tuple(next(parts) if _has_memory(part) else part for part in old)  # noqa: E731
     forces, contacts, (emitter,) = renewed(scene.forces), renewed(scene.contacts), renewed((scene.emitter,))
-    return scene.having(state=state, forces=forces, contacts=contacts, emitter=emitter)
+    return scene.replace(state=state, forces=forces, contacts=contacts, emitter=emitter)
 
 
-def _remembers(part: Any) -> bool:
+def _has_memory(part: Any) -> bool:
     return hasattr(part, "advance") or bool(getattr(part, "memory", ()))
 
 
-def _method_name(method: Any) -> str:
+def _get_method_name(method: Any) -> str:
     return getattr(method, "__name__", type(method).__name__)
 
 
-def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
+def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
     """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
     ours, made_by = "dt" in arrays, str(arrays.pop("method"))
-    if ours and method is not None and made_by not in (_method_name(method), "NoneType"):
+    if ours and method is not None and made_by not in (_get_method_name(method), "NoneType"):
         raise ValueError(
-            f"load: the run was made with the method {made_by}, got {_method_name(method)}. Give the method it was made "
+            f"load: the run was made with the method {made_by}, got {_get_method_name(method)}. Give the method it was made "
             "with; to go on with another one, simulate(run.final_scene, ...)."
         )
     if scene is not None and ours:
-        scene = _in_precision(scene, arrays)
+        scene = _cast_to_run(scene, arrays)
     # a run of float64 without 64-bit types stays in NumPy, where nothing is rounded
     exact = lambda array: ours and jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype  # noqa: E731
     floats = [array for array in arrays.values() if array.dtype.kind == "f"]
@@ -275,20 +277,20 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
     recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
     state = parts = final_scene = None
     if scene is not None and ours:
-        final_state = _filled("final_state", scene.state, arrays)
+        final_state = _fill_tree("final_state", scene.state, arrays)
         if final_state.position.shape != scene.state.position.shape:
             raise ValueError(
                 f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
                 "Give the scene the run was made with."
             )
-        final_parts = _filled("final_parts", memories(scene), arrays, shaped=True)
-        _demand_same_contacts(memories(scene), final_parts)
-        final_scene = _remembering(scene, final_state, final_parts)
+        final_parts = _fill_tree("final_parts", select_stateful_parts(scene), arrays, shaped=True)
+        _demand_same_contacts(select_stateful_parts(scene), final_parts)
+        final_scene = _replace_memories(scene, final_state, final_parts)
         if not recorded:
-            parts = _filled("parts", memories(scene), arrays, shaped=True)
-            _demand_same_contacts(memories(scene), parts)
+            parts = _fill_tree("parts", select_stateful_parts(scene), arrays, shaped=True)
+            _demand_same_contacts(select_stateful_parts(scene), parts)
     if not recorded:
-        state = _filled("state", Particles(0, 0) if scene is None else scene.state, arrays)
+        state = _fill_tree("state", Particles(0, 0) if scene is None else scene.state, arrays)
     return cls(
         time=arrays["time"],
         state=state,
@@ -305,7 +307,7 @@ def _restored(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, met
     )
 
 
-def _in_precision(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:
+def _cast_to_run(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:
     """The scene with its numbers in the run's precision, as they were when it was made; ValueError where they are coarser."""
     run, here = arrays.get("final_state.position", arrays["time"]).dtype, scene.state.dtype
     if run == here:
@@ -320,11 +322,15 @@ def _in_precision(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:
 
 def _demand_same_contacts(given: tuple, found: tuple) -> None:
     """Raise a ValueError naming a number of a contact, which never changes, that is another one in the file."""
-    still = [jax.tree.map(lambda changing: not changing, changes(part)) for part in given if isinstance(part, Contact)]
+    still = [
+        jax.tree.map(lambda changing: not changing, build_memory_mask(part))
+        for part in given
+        if isinstance(part, Contact)
+    ]
     pick = lambda parts: [part for part in parts if isinstance(part, Contact)]  # noqa: E731
     here, there = eqx.filter(pick(given), still), eqx.filter(pick(found), still)
     for (keys, ours), theirs in zip(jax.tree_util.tree_leaves_with_path(here), jax.tree.leaves(there), strict=True):
-        if concrete(ours) is not None and not np.array_equal(ours, theirs):
+        if concrete_or_none(ours) is not None and not np.array_equal(ours, theirs):
             name = jax.tree_util.keystr(keys, simple=True, separator=".").partition(".")[2]
             raise ValueError(
                 f"load: the run was made with a contact whose {name} was {np.asarray(theirs)}, in the given scene it is "
@@ -332,7 +338,7 @@ def _demand_same_contacts(given: tuple, found: tuple) -> None:
             )
 
 
-def _filled(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> Any:
+def _fill_tree(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> Any:
     """The pytree `like` with its leaves replaced by that group of arrays, `shaped` as they are, of parts also with frames."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]

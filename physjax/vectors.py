@@ -26,7 +26,7 @@ def components(v: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes"]]:
     return [v[..., i] for i in range(v.shape[-1])]
 
 
-def stacked(parts: list[Float[Array, "*lanes"]]) -> Float[Array, "*lanes dim"]:
+def stack_components(parts: list[Float[Array, "*lanes"]]) -> Float[Array, "*lanes dim"]:
     """A vector from its components."""
     return jnp.stack(parts, axis=-1)
 
@@ -101,7 +101,7 @@ def spin(omega: Float[Array, "..."], v: Float[Array, "*lanes dim"]) -> Float[Arr
     """ω × v: a vector ω, `(3,)` or per lane, in space; a number ω, scalar or per lane, in the plane."""
     if v.shape[-1] == 2:
         return scale(omega, turn_left(v))
-    return cross(over(omega, v), v)
+    return cross(broadcast_vector(omega, v), v)
 
 
 def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -112,7 +112,7 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
     return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
 
 
-def over(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+def broadcast_vector(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """One vector `(dim,)` for all lanes, or one per lane, broadcast to the shape of `like`.
 
     Raises ValueError for a number, or a vector of another length: broadcast, it would point somewhere unmeant.
@@ -124,7 +124,7 @@ def over(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float
     return jnp.broadcast_to(vector, like.shape)
 
 
-def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+def axis_vector(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """A vector along axis `up` with the given amount, scalar or per lane, shaped like `like`.
 
     Raises ValueError where there is no such axis.
@@ -143,7 +143,7 @@ def upward(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes dim"
 # quaternions (w, x, y, z); by lists of components, since XLA on CPU computes a vector anew for each reader of a component
 
 
-def composed(a: list, b: list) -> list:
+def multiply_quaternions(a: list, b: list) -> list:
     """Hamilton's product ab of quaternions in components: the turn b, then the turn a."""
     w, x, y, z = a
     s, u, v, n = b
@@ -155,13 +155,13 @@ def composed(a: list, b: list) -> list:
     ]
 
 
-def reverse(q: list) -> list:
+def conjugate_quaternion(q: list) -> list:
     """The turn back, in components: (w, -x, -y, -z)."""
     w, x, y, z = q
     return [w, -x, -y, -z]
 
 
-def turned(q: list, v: list) -> list:
+def rotate_components(q: list, v: list) -> list:
     """The vector v turned by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
     w, x, y, z = q
     a, b, c = v
@@ -169,11 +169,11 @@ def turned(q: list, v: list) -> list:
     return [a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p]
 
 
-def turn(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+def rotate_vector(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """The vector v turned by the unit quaternion q: from the body's frame to the world's, for an orientation q."""
-    return stacked(turned(components(q), components(v)))
+    return stack_components(rotate_components(components(q), components(v)))
 
 
-def turn_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+def rotate_vector_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """The vector v turned back by the unit quaternion q: from the world's frame to the body's."""
-    return stacked(turned(reverse(components(q)), components(v)))
+    return stack_components(rotate_components(conjugate_quaternion(components(q)), components(v)))

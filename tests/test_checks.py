@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physjax.checks import concrete, demand, known, positive_integer, quantity, real_array, real_quantity
+from physjax.checks import (
+    as_positive_integer,
+    as_real_array,
+    as_real_quantity,
+    concrete_or_none,
+    demand_all,
+    demand_known,
+    quantity,
+)
 
 quickly = settings(max_examples=40, deadline=None)
 
@@ -24,25 +32,25 @@ class Body(eqx.Module):
 
 def test_python_numbers_stay_weak_and_arrays_keep_their_type(precision):
     for number in (2, 2.5):
-        array = real_array("x", number)
+        array = as_real_array("x", number)
         assert array.weak_type
         assert array.dtype == precision.dtype
         assert array == number
     for dtype in (jnp.float32, jnp.float16):
-        assert real_array("x", np.ones(3, dtype)).dtype == dtype
-    assert real_array("x", [1, 2]).dtype == precision.dtype, "integers become floats"
-    assert real_array("x", np.int32(3)).dtype == precision.dtype
+        assert as_real_array("x", np.ones(3, dtype)).dtype == dtype
+    assert as_real_array("x", [1, 2]).dtype == precision.dtype, "integers become floats"
+    assert as_real_array("x", np.int32(3)).dtype == precision.dtype
 
 
 @pytest.mark.parametrize("value", [True, np.array([True]), 1j, np.ones(2, complex), "12", None, object(), {}])
 def test_what_is_no_real_number_is_a_type_error(value):
     with pytest.raises(TypeError, match=r"^mass: got .*, expected real"):
-        real_array("mass", value)
+        as_real_array("mass", value)
 
 
 def test_long_values_are_shown_short():
     with pytest.raises(TypeError) as error:
-        real_array("mass", "x" * 1000)
+        as_real_array("mass", "x" * 1000)
     assert len(str(error.value)) < 150
 
 
@@ -53,12 +61,12 @@ def test_the_first_wrong_entry_is_named_and_the_wrong_ones_are_counted(data):
     good = data.draw(nps.arrays(bool, shape))
     values = np.arange(good.size, dtype=float).reshape(shape)
     if good.all():
-        demand("x", jnp.asarray(values), good, "anything")
+        demand_all("x", jnp.asarray(values), good, "anything")
         return
     first = tuple(int(i) for i in np.argwhere(~good)[0])
     where = str(first[0] if len(first) == 1 else first)
     with pytest.raises(ValueError) as error:
-        demand("x", jnp.asarray(values), good, "less")
+        demand_all("x", jnp.asarray(values), good, "less")
     wrong = int((~good).sum())
     assert str(error.value) == (
         f"x: got {values[first]} at index {where} ({wrong} of {good.size} entries are wrong), expected less."
@@ -71,9 +79,9 @@ def test_numbers_that_are_not_finite_are_found_wherever_they_stand(bad, index):
     values = np.ones(5)
     values[index] = bad
     with pytest.raises(ValueError, match=rf"speed: got {bad} at index {index} .* expected finite numbers"):
-        real_quantity("speed", values)
+        as_real_quantity("speed", values)
     with pytest.raises(ValueError, match=rf"speed: got {bad}, expected finite numbers"):
-        real_quantity("speed", bad)
+        as_real_quantity("speed", bad)
 
 
 @quickly
@@ -81,25 +89,25 @@ def test_numbers_that_are_not_finite_are_found_wherever_they_stand(bad, index):
 def test_bounds_hold_strictly_or_not_as_they_say(value):
     for options, allowed, words in (({"above": 0}, value > 0, "> 0"), ({"at_least": 0.5}, value >= 0.5, ">= 0.5")):
         if allowed:
-            assert real_quantity("x", value, **options) == value
+            assert as_real_quantity("x", value, **options) == value
         else:
             with pytest.raises(ValueError, match=rf"x: got .*, expected numbers {words}"):
-                real_quantity("x", value, **options)
+                as_real_quantity("x", value, **options)
 
 
 def test_values_are_not_looked_at_while_they_are_traced_but_types_are():
-    assert jax.jit(lambda x: real_quantity("x", x, above=0))(-1.0) == -1.0
-    assert jax.grad(lambda x: real_quantity("x", x, above=0) ** 2)(-1.0) == -2.0
-    np.testing.assert_array_equal(jax.vmap(lambda x: real_quantity("x", x, above=0))(-jnp.ones(3)), -np.ones(3))
+    assert jax.jit(lambda x: as_real_quantity("x", x, above=0))(-1.0) == -1.0
+    assert jax.grad(lambda x: as_real_quantity("x", x, above=0) ** 2)(-1.0) == -2.0
+    np.testing.assert_array_equal(jax.vmap(lambda x: as_real_quantity("x", x, above=0))(-jnp.ones(3)), -np.ones(3))
     with pytest.raises(TypeError, match="x: got dtype complex128, expected real"):
-        jax.jit(lambda x: real_quantity("x", x))(1j)
+        jax.jit(lambda x: as_real_quantity("x", x))(1j)
 
 
 def test_what_is_traced_has_no_concrete_value():
     seen = []
-    jax.jit(lambda x: seen.append(concrete(x)))(1.0)
+    jax.jit(lambda x: seen.append(concrete_or_none(x)))(1.0)
     assert seen == [None]
-    assert isinstance(concrete(jnp.ones(2)), np.ndarray)
+    assert isinstance(concrete_or_none(jnp.ones(2)), np.ndarray)
 
 
 def test_a_quantity_is_an_array_leaf_that_keeps_its_unit():
@@ -129,23 +137,23 @@ def test_a_bad_quantity_is_named_with_its_unit(numbers, error, message, unannota
 
 
 def test_counts_are_python_integers_of_at_least_one():
-    assert positive_integer("steps", np.int64(7)) == 7
-    assert type(positive_integer("steps", np.int64(7))) is int
-    assert positive_integer("index", 0, at_least=0) == 0
+    assert as_positive_integer("steps", np.int64(7)) == 7
+    assert type(as_positive_integer("steps", np.int64(7))) is int
+    assert as_positive_integer("index", 0, at_least=0) == 0
     for value in (0, -3):
         with pytest.raises(ValueError, match=rf"steps: got {value}, expected at least 1"):
-            positive_integer("steps", value)
+            as_positive_integer("steps", value)
     for value in (1.0, True, "3", None, jnp.ones(())):
         with pytest.raises(TypeError, match=r"steps: got .*, expected an integer"):
-            positive_integer("steps", value)
+            as_positive_integer("steps", value)
     with pytest.raises(TypeError, match=r"steps: got a traced value, .* Pass it as a static argument"):
-        jax.jit(lambda n: positive_integer("steps", n))(3)
+        jax.jit(lambda n: as_positive_integer("steps", n))(3)
 
 
 def test_an_unknown_name_is_answered_with_the_nearest():
     names = ["verlet", "leapfrog", "rk4", "euler"]
-    assert known("method", "rk4", names) == "rk4"
+    assert demand_known("method", "rk4", names) == "rk4"
     with pytest.raises(ValueError, match=r"unknown method 'leepfrog'\. Did you mean leapfrog or euler\?"):
-        known("method", "leepfrog", iter(names))
+        demand_known("method", "leepfrog", iter(names))
     with pytest.raises(ValueError, match=r"unknown method 'zzz'\. Known: euler, leapfrog, rk4, verlet\."):
-        known("method", "zzz", names)
+        demand_known("method", "zzz", names)

@@ -10,7 +10,7 @@ import pytest
 
 from physjax import Particles, Scene, Trajectory, contacts, forces, methods, reference, simulate
 from physjax.study.sweeps.observables import height
-from physjax.vectors import scale, upward
+from physjax.vectors import axis_vector, scale
 
 SPEEDS = np.array([[10.0, 12.0], [3.0, 14.0], [20.0, 8.0]])
 
@@ -187,7 +187,7 @@ def test_coupled_nodes_have_moments_of_their_own():
     assert at.ok.all()
     assert len(set(at.time.ravel().tolist())) == 4
     for scene in range(2):
-        alone = run.scene.having(state=jax.tree.map(lambda leaf, s=scene: leaf[s], run.scene.state))
+        alone = run.scene.replace(state=jax.tree.map(lambda leaf, s=scene: leaf[s], run.scene.state))
         order = np.argsort(at.time[scene])
         truth = reference(alone, np.asarray(at.time[scene])[order])
         for moment, node in enumerate(order):
@@ -210,7 +210,7 @@ class Burner(eqx.Module):
     fuel: jax.Array
 
     def __call__(self, t, state, mass):
-        return upward(self.fuel, 1, state.velocity)
+        return axis_vector(self.fuel, 1, state.velocity)
 
     def advance(self, t, dt, state):
         return Burner(scale(1 - dt, self.fuel)), state

@@ -5,14 +5,14 @@ import stat
 
 import pytest
 
-from physjax.files import replacing, writable_folder
+from physjax.files import ensure_writable_folder, write_atomically
 
 
 @pytest.mark.parametrize(("mode", "content"), [("w", "ω = 2π/T\n"), ("wb", b"\x00\r\n\xff")])
 def test_the_content_arrives_unchanged_and_replaces_what_was_there(tmp_path, mode, content):
     path = tmp_path / "result.txt"
     path.write_text("old")
-    with replacing(path, mode) as file:
+    with write_atomically(path, mode) as file:
         file.write(content)
         assert path.read_text() == "old", "the place is taken only when the block ends"
     assert path.read_bytes() == (content if mode == "wb" else content.encode("utf-8"))
@@ -25,7 +25,7 @@ def test_a_block_that_fails_leaves_the_old_file_and_no_litter(tmp_path, error, b
     path = tmp_path / "result.txt"
     if before:
         path.write_text(before)
-    with pytest.raises(error), replacing(path) as file:  # noqa: PT012
+    with pytest.raises(error), write_atomically(path) as file:  # noqa: PT012
         file.write("half of the new")
         file.flush()
         raise error
@@ -33,7 +33,7 @@ def test_a_block_that_fails_leaves_the_old_file_and_no_litter(tmp_path, error, b
 
 
 def test_line_ends_are_those_that_were_written(tmp_path):
-    with replacing(tmp_path / "table.csv") as file:
+    with write_atomically(tmp_path / "table.csv") as file:
         file.write("a\r\nb\n")
     assert (tmp_path / "table.csv").read_bytes() == b"a\r\nb\n"
 
@@ -43,7 +43,7 @@ def test_line_ends_are_those_that_were_written(tmp_path):
 def test_the_file_has_the_rights_of_any_new_file(tmp_path, umask, mode):
     before = os.umask(umask)
     try:
-        with replacing(tmp_path / "result.txt") as file:
+        with write_atomically(tmp_path / "result.txt") as file:
             file.write("x")
         assert os.umask(umask) == umask, "the process's umask is left as it was"
     finally:
@@ -53,7 +53,7 @@ def test_the_file_has_the_rights_of_any_new_file(tmp_path, umask, mode):
 
 def test_a_bare_name_is_written_here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with replacing("result.txt") as file:
+    with write_atomically("result.txt") as file:
         file.write("here")
     assert (tmp_path / "result.txt").read_text() == "here"
 
@@ -64,24 +64,24 @@ def test_a_missing_folder_is_a_plain_error(tmp_path):
         pytest.raises(
             FileNotFoundError, match=r"cannot write .*result\.txt: .*nowhere does not exist\. Create it first"
         ),
-        replacing(missing),
+        write_atomically(missing),
     ):
         pytest.fail("the block must not run")
 
 
 def test_a_folder_is_made_with_its_parents_and_left_empty(tmp_path):
-    folder = writable_folder(str(tmp_path / "a" / "b"))
+    folder = ensure_writable_folder(str(tmp_path / "a" / "b"))
     assert folder == tmp_path / "a" / "b"
     assert folder.is_dir()
     assert not list(folder.iterdir())
-    assert writable_folder(folder) == folder, "one that is there already will do"
+    assert ensure_writable_folder(folder) == folder, "one that is there already will do"
 
 
 def test_a_folder_that_cannot_be_written_is_a_plain_error(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(OSError, match=r"cannot write into .*file.*\. Choose another folder\."):
-            writable_folder(path)
+            ensure_writable_folder(path)
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
@@ -89,7 +89,7 @@ def test_a_folder_without_the_right_to_write_is_a_plain_error(tmp_path):
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(OSError, match=r"cannot write into .*Permission denied\. Choose another folder\."):
-            writable_folder(tmp_path)
+            ensure_writable_folder(tmp_path)
     finally:
         tmp_path.chmod(0o700)
 
@@ -99,6 +99,6 @@ def test_a_durable_file_is_on_the_disk_before_it_takes_its_place_and_its_name_af
     done, sync, replace = [], os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (done.append(stat.S_ISDIR(os.fstat(handle).st_mode)), sync(handle)))
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
-    with replacing(tmp_path / "result.txt", durable=True) as file:
+    with write_atomically(tmp_path / "result.txt", durable=True) as file:
         file.write("here")
     assert done == [False, "replace", True]

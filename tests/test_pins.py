@@ -34,7 +34,7 @@ class Swing(eqx.Module):
 def rope(path=swing, state=LINE.state, **parts):
     pins = Pins(START, path)
     terms = (forces.Gravity(), LINE.springs)
-    return Scene(pins.lead(0.0, state), LINE.mass, terms, pinned=pins, **parts)
+    return Scene(pins.prescribe(0.0, state), LINE.mass, terms, pinned=pins, **parts)
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
@@ -65,7 +65,7 @@ def test_the_reference_follows_the_path_too():
 
 def test_dampers_and_drag_feel_the_path_s_velocity():
     pins = Pins(np.array([True, False]), lambda t: jnp.array([2.0, 0.0]) * t)
-    start = pins.lead(0.0, Particles(jnp.array([[0.0, 0.0], [1.0, 0.0]]), jnp.zeros((2, 2))))
+    start = pins.prescribe(0.0, Particles(jnp.array([[0.0, 0.0], [1.0, 0.0]]), jnp.zeros((2, 2))))
     damper = lattices.rope((0.0, 0.0), (1.0, 0.0), 2, mass=1.0, stiffness=0.0, damping=3.0).springs
     scene = Scene(start, 1.0, (damper,), pinned=pins)
     np.testing.assert_array_equal(scene.state.velocity, [[2.0, 0.0], [0.0, 0.0]])
@@ -97,7 +97,7 @@ def test_numbers_of_a_path_are_swept_and_differentiated():
 def test_each_scene_may_have_a_step_of_its_own():
     many = jnp.broadcast_to(LINE.state.position, (3, 5, 2))
     pins = Pins(np.tile(START, (3, 1)), swing)
-    state = pins.lead(0.0, Particles(many, jnp.zeros_like(many)))
+    state = pins.prescribe(0.0, Particles(many, jnp.zeros_like(many)))
     scene = Scene(state, LINE.mass[None] * jnp.ones((3, 1)), (forces.Gravity(), LINE.springs), pinned=pins)
     flight = simulate(scene, methods.rk4, dt=jnp.array([1e-3, 2e-3, 4e-3]), steps=50, save_every=50)
     np.testing.assert_allclose(flight.position[-1, :, 0], swing(flight.time[-1][:, None])[:, 0], rtol=0, atol=1e-15)
@@ -116,7 +116,7 @@ def test_what_is_led_passes_contacts_and_the_rest_does_not():
 
 def test_a_mask_is_held_and_pins_say_who_is(unannotated):
     held = Scene(LINE.state, LINE.mass, (LINE.springs,), pinned=START)
-    assert held.led is None
+    assert held.prescribed_motion is None
     assert Scene(LINE.state, LINE.mass).held is None
     np.testing.assert_array_equal(held.held, START)
     led = rope()
@@ -136,7 +136,12 @@ def test_a_mask_is_held_and_pins_say_who_is(unannotated):
         (START, lambda t: jnp.zeros((2, 5, 2)), ValueError, r"path returns float64 of shape \(2, 5, 2\)"),
         (START, lambda t: jnp.array([t / 0.0, t]), ValueError, r"path\(0\) \[m\] is .* at lane \[0\], expected finite"),
         (START, lambda t: jnp.array([jnp.sqrt(t), t]), ValueError, r"velocity of the path at t = 0 .* expected finite"),
-        (START, lambda t: jnp.array([t, t + 1.0]), ValueError, r"1 of 1 led lanes .* lane \[0\] is at .* pins\.lead\("),
+        (
+            START,
+            lambda t: jnp.array([t, t + 1.0]),
+            ValueError,
+            r"1 of 1 led lanes .* lane \[0\] is at .* pins\.prescribe\(",
+        ),
     ],
 )
 def test_bad_pins_are_answered_in_plain_words(nodes, path, error, message, unannotated):
@@ -151,7 +156,7 @@ def test_a_led_lane_passes_what_others_bounce_off_in_time():
     start = Particles(still.at[1, 1].set(1.0), still)
     path = lambda t: jnp.stack([0.5 * t, -jnp.sin(t)], axis=-1)  # noqa: E731
     pins = Pins(jnp.asarray([True, False]), path)
-    both = Scene(pins.lead(0.0, start), forces=(forces.Gravity(),), contacts=(floor,), pinned=pins)
+    both = Scene(pins.prescribe(0.0, start), forces=(forces.Gravity(),), contacts=(floor,), pinned=pins)
     alone = Scene(Particles(start.position[1], start.velocity[1]), forces=(forces.Gravity(),), contacts=(floor,))
     one, other = (simulate(scene, methods.rk4, dt=0.01, steps=200) for scene in (both, alone))
     np.testing.assert_allclose(one.position[:, 0], path(one.time), rtol=0, atol=1e-14)

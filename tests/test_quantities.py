@@ -25,7 +25,7 @@ from physjax import (
 )
 from physjax.physics.forces import flows
 from physjax.physics.rigid import inertia
-from physjax.stepping.blocks import FEWEST_STEPS, SMALLEST, Blocks
+from physjax.stepping.blocks import MIN_LANES_TO_CUT, MIN_STEPS_PER_FRAME, Blocks
 
 BALL = Particles(jnp.array([0.0, 1.0]), jnp.array([3.0, 4.0]))
 TWO = np.array([0.1, 0.2])
@@ -251,9 +251,9 @@ def tables(kind, entries):
 @pytest.mark.parametrize(
     ("count", "kind"),
     [
-        (SMALLEST, "Control"),
-        (SMALLEST, "declared"),
-        (SMALLEST, "not declared"),
+        (MIN_LANES_TO_CUT, "Control"),
+        (MIN_LANES_TO_CUT, "declared"),
+        (MIN_LANES_TO_CUT, "not declared"),
         pytest.param(1024, "Control", marks=pytest.mark.slow),
         pytest.param(1024, "declared", marks=pytest.mark.slow),
         pytest.param(1024, "not declared", marks=pytest.mark.slow),
@@ -273,21 +273,21 @@ def test_a_table_as_long_as_the_lanes_is_not_cut_with_them(count, kind):
             else (forces.Gravity(), force)
         )
         scene = Scene(state, forces=parts, contacts=floor)
-        steps = 4 * FEWEST_STEPS
+        steps = 4 * MIN_STEPS_PER_FRAME
         return simulate(scene, methods.euler, dt=0.0125, steps=steps, save_every=steps).position[-1]
 
     np.testing.assert_allclose(np.asarray(ends(slice(None)))[some], ends(some), atol=1e-12)
 
 
 def test_lanes_are_cut_by_what_is_declared_and_stay_together_where_nothing_is():
-    state = Particles(jnp.zeros((SMALLEST, 2)), jnp.zeros((SMALLEST, 2)))
-    thrust = np.linspace(0.0, 1.0, SMALLEST)
-    cut = lambda force: Blocks.of(Scene(state, forces=(force,)), state, FEWEST_STEPS) is not None  # noqa: E731
+    state = Particles(jnp.zeros((MIN_LANES_TO_CUT, 2)), jnp.zeros((MIN_LANES_TO_CUT, 2)))
+    thrust = np.linspace(0.0, 1.0, MIN_LANES_TO_CUT)
+    cut = lambda force: Blocks.of(Scene(state, forces=(force,)), state, MIN_STEPS_PER_FRAME) is not None  # noqa: E731
     assert cut(Engine(thrust, np.ones(4)))
-    assert cut(Engine(thrust, np.ones(SMALLEST)))
-    assert cut(DeclaredLift(jnp.ones(SMALLEST)))
-    assert not cut(Lift(jnp.ones(SMALLEST)))
-    assert not cut(Lift(jnp.ones((3, SMALLEST))))
+    assert cut(Engine(thrust, np.ones(MIN_LANES_TO_CUT)))
+    assert cut(DeclaredLift(jnp.ones(MIN_LANES_TO_CUT)))
+    assert not cut(Lift(jnp.ones(MIN_LANES_TO_CUT)))
+    assert not cut(Lift(jnp.ones((3, MIN_LANES_TO_CUT))))
 
 
 def test_one_lane_of_two_keeps_a_vector_of_two_components_whole():

@@ -13,8 +13,8 @@ import pytest
 
 from physjax import Particles, Scene, Trajectory, contacts, emitters, forces, methods, reference, simulate
 from physjax.stepping.methods import METHODS
-from physjax.trajectory import memories
-from physjax.vectors import scale, upward
+from physjax.trajectory import select_stateful_parts
+from physjax.vectors import axis_vector, scale
 
 RATE, RESERVE, DT = 0.5, 0.8, 0.01
 
@@ -28,7 +28,7 @@ class Thruster(eqx.Module):
     burning: jax.Array
 
     def __call__(self, t, state, mass):
-        return upward(jnp.where(self.burning, scale(self.push, self.fuel), 0.0), 1, state.velocity)
+        return axis_vector(jnp.where(self.burning, scale(self.push, self.fuel), 0.0), 1, state.velocity)
 
     def advance(self, t, dt, state):
         fuel = jnp.where(self.burning, self.fuel * (1 - RATE * dt), self.fuel)
@@ -414,7 +414,7 @@ def test_a_run_of_another_method_or_contact_is_refused(flight, tmp_path):
     run = simulate(Scene(scene.state, forces=scene.forces), methods.verlet, dt=DT, steps=2)
     final = eqx.tree_at(lambda scene: scene.state, scene, run.final_scene.state)
     parts = lambda run: (run.scene, run.final_scene, run.parts)  # noqa: E731
-    run = eqx.tree_at(parts, run, (scene, final, memories(scene)))
+    run = eqx.tree_at(parts, run, (scene, final, select_stateful_parts(scene)))
     run.save(tmp_path / "bounce.npz")
     same(Trajectory.load(tmp_path / "bounce.npz", scene=bouncing(0.8)).final_scene, run.final_scene)
     with pytest.raises(ValueError, match=r"restitution was 0\.8, in the given scene it is 0\.5"):

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from physjax.vectors import (
+    axis_vector,
+    broadcast_vector,
     components,
-    composed,
+    conjugate_quaternion,
     cross,
     dot,
+    multiply_quaternions,
     norm,
-    over,
-    reverse,
     root_and_inverse,
+    rotate_components,
+    rotate_vector,
+    rotate_vector_back,
     scale,
     spin,
     square_root,
-    stacked,
-    turn,
-    turn_back,
+    stack_components,
     turn_left,
-    turned,
     unit,
-    upward,
 )
 
 # large and odd sizes, because jax 0.10.2 returned wrong rows for some of them on CPU (jax issue 39103)
@@ -35,17 +35,17 @@ def everything(a, b, flat, number, vector, amount):
     """Every helper at once, so that a size costs one compilation."""
     p, q = ([number, *components(v)] for v in (a, b))
     return {
-        "composed": stacked(composed(p, q)),
-        "reverse": stacked(reverse(p)),
-        "turned": stacked(turned(p, components(b))),
-        "turn": turn(stacked(p), b),
-        "turn_back": turn_back(stacked(p), b),
+        "multiply_quaternions": stack_components(multiply_quaternions(p, q)),
+        "conjugate_quaternion": stack_components(conjugate_quaternion(p)),
+        "rotate_components": stack_components(rotate_components(p, components(b))),
+        "rotate_vector": rotate_vector(stack_components(p), b),
+        "rotate_vector_back": rotate_vector_back(stack_components(p), b),
         "dot": dot(a, b),
         "dot in the plane": dot(flat, turn_left(flat) + flat),
         "components": components(a)[1],
-        "stacked": stacked(components(a)),
+        "stack_components": stack_components(components(a)),
         "square_root": square_root(dot(a, a)),
-        "root_and_inverse": stacked(list(root_and_inverse(dot(a, a)))),
+        "root_and_inverse": stack_components(list(root_and_inverse(dot(a, a)))),
         "norm": norm(a),
         "unit": unit(a),
         "cross": cross(a, b),
@@ -55,9 +55,9 @@ def everything(a, b, flat, number, vector, amount):
         "turn_left": turn_left(flat),
         "scale": scale(number, a),
         "scale by one number": scale(amount, a),
-        "over": over(vector, a),
-        "upward": upward(number, 2, a),
-        "upward, one number": upward(amount, 1, flat),
+        "broadcast_vector": broadcast_vector(vector, a),
+        "axis_vector": axis_vector(number, 2, a),
+        "axis_vector, one number": axis_vector(amount, 1, flat),
     }
 
 
@@ -75,14 +75,14 @@ def expected(a, b, flat, number, vector, amount):
     far = ((1 + size(p, axis=-1)) ** 2 * size(b, axis=-1))[:, None]
     around = (size(p, axis=-1) * np.hypot(number, size(b, axis=-1)))[:, None]
     return {
-        "composed": (twist, around),
-        "reverse": (p * [1, -1, -1, -1], 0.0),
-        "turned": (b + 2 * n * bent + twice, far),
-        "turn": (b + 2 * n * bent + twice, far),
-        "turn_back": (b - 2 * n * bent + twice, far),
+        "multiply_quaternions": (twist, around),
+        "conjugate_quaternion": (p * [1, -1, -1, -1], 0.0),
+        "rotate_components": (b + 2 * n * bent + twice, far),
+        "rotate_vector": (b + 2 * n * bent + twice, far),
+        "rotate_vector_back": (b - 2 * n * bent + twice, far),
         "dot": (np.sum(a * b, axis=-1), products[:, 0]),
         "components": (a[:, 1], 0.0),
-        "stacked": (a, 0.0),
+        "stack_components": (a, 0.0),
         "dot in the plane": (np.sum(flat * flat, axis=-1), 2 * np.sum(flat * flat, axis=-1)),
         "square_root": (length, length),
         "root_and_inverse": (np.stack([length, 1 / length], axis=-1), np.stack([length, 1 / length], axis=-1)),
@@ -95,9 +95,9 @@ def expected(a, b, flat, number, vector, amount):
         "turn_left": (left, 0.0),
         "scale": (number[:, None] * a, np.abs(number[:, None] * a)),
         "scale by one number": (amount * a, np.abs(amount * a)),
-        "over": (np.broadcast_to(vector, a.shape), 0.0),
-        "upward": (axis, 0.0),
-        "upward, one number": (np.broadcast_to([0.0, amount], flat.shape), 0.0),
+        "broadcast_vector": (np.broadcast_to(vector, a.shape), 0.0),
+        "axis_vector": (axis, 0.0),
+        "axis_vector, one number": (np.broadcast_to([0.0, amount], flat.shape), 0.0),
     }
 
 
@@ -193,8 +193,13 @@ def test_second_derivatives_in_a_loop_are_zero_at_zero_in_any_nesting_of_the_mod
         push = lambda v, _: (v - scale(norm(v), v) + 0.1 * unit(v) + square_root(dot(v, v)), None)  # noqa: E731
         return jax.lax.scan(push, v, None, length=3)[0][0]
 
-    forward, reverse = jax.jacfwd, jax.jacrev
-    nestings = [(forward, forward), (forward, reverse), (reverse, reverse), (reverse, forward)]
+    forward, backward = jax.jacfwd, jax.jacrev
+    nestings = [
+        (forward, forward),
+        (forward, backward),
+        (backward, backward),
+        (backward, forward),
+    ]
     for second in jax.jit(lambda v: [outer(inner(end))(v) for outer, inner in nestings])(jnp.zeros(2)):
         np.testing.assert_array_equal(second, np.zeros((2, 2)))
 
@@ -202,21 +207,21 @@ def test_second_derivatives_in_a_loop_are_zero_at_zero_in_any_nesting_of_the_mod
 @pytest.mark.parametrize("shape", [(), (2,), (4, 1)])
 def test_a_vector_of_another_length_is_not_spread_over_the_components(shape):
     with pytest.raises(ValueError, match=r"got a vector of shape .* expected \(3,\) for all lanes or \(4, 3\)"):
-        over(jnp.ones(shape), jnp.zeros((4, 3)))
+        broadcast_vector(jnp.ones(shape), jnp.zeros((4, 3)))
 
 
 def test_an_axis_that_is_not_there_is_a_plain_error():
     with pytest.raises(ValueError, match=r"up: got axis 1, .* 1 components.*Give an axis from 0 to 0"):
-        upward(jnp.asarray(9.8), 1, jnp.zeros((4, 1)))
+        axis_vector(jnp.asarray(9.8), 1, jnp.zeros((4, 1)))
 
 
 def test_quaternions_turn_as_matrices_do():
     quarter = jnp.asarray([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # about z
-    np.testing.assert_allclose(turn(quarter, jnp.asarray([1.0, 0.0, 2.0])), [0.0, 1.0, 2.0], atol=1e-15)
+    np.testing.assert_allclose(rotate_vector(quarter, jnp.asarray([1.0, 0.0, 2.0])), [0.0, 1.0, 2.0], atol=1e-15)
     rng = np.random.default_rng(4)
     p, q = (unit(jnp.asarray(rng.normal(size=(9, 4)))) for _ in range(2))
     v = jnp.asarray(rng.normal(size=(9, 3)))
-    both = stacked(composed(components(p), components(q)))
-    np.testing.assert_allclose(turn(both, v), turn(p, turn(q, v)), atol=1e-14)
-    np.testing.assert_allclose(turn_back(p, turn(p, v)), v, atol=1e-14)
-    np.testing.assert_allclose(norm(turn(p, v)), norm(v), rtol=1e-14)
+    both = stack_components(multiply_quaternions(components(p), components(q)))
+    np.testing.assert_allclose(rotate_vector(both, v), rotate_vector(p, rotate_vector(q, v)), atol=1e-14)
+    np.testing.assert_allclose(rotate_vector_back(p, rotate_vector(p, v)), v, atol=1e-14)
+    np.testing.assert_allclose(norm(rotate_vector(p, v)), norm(v), rtol=1e-14)

@@ -35,7 +35,7 @@ def bouncing_ball(restitution: float = 0.8, wind: float = 10.0, g: float = 9.8) 
     air = _Downdraught(g, wind, np.sqrt(2 * mass * g / (density * coefficient * area)))
 
     def exact(t):
-        height, velocity = _bounced(t, air, drop, restitution)
+        height, velocity = _trace_bounces(t, air, drop, restitution)
         return Particles(radius + height[..., None], velocity[..., None])
 
     def rebound(flight):
@@ -229,7 +229,7 @@ class _Downdraught(NamedTuple):
         return t
 
 
-def _bounced(times, air, height, restitution):
+def _trace_bounces(times, air, height, restitution):
     """Height and velocity at the times (rows) of balls dropped from rest at heights (columns)."""
     t, floor = times[:, None], np.zeros_like(height)
     begun = velocity = position = speed = floor

@@ -27,7 +27,7 @@ class Entry(NamedTuple):
         )
 
 
-def entry(name: str) -> tuple[Entry, Problem]:
+def describe_scene(name: str) -> tuple[Entry, Problem]:
     """What is known of a scene, and the scene itself, in float64."""
     import jax
 
@@ -35,7 +35,7 @@ def entry(name: str) -> tuple[Entry, Problem]:
         problem = SCENES[name]()
     truths = [truth.statement for truth in problem.truths]
     known = ["closed form"] if problem.exact is not None else []
-    return Entry(name, title(name), _size(problem), "; ".join(known + truths)), problem
+    return Entry(name, title(name), _describe_size(problem), "; ".join(known + truths)), problem
 
 
 def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception | None]]:
@@ -43,41 +43,41 @@ def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception 
 
     Yields each name when it is done, with what went wrong if something did: the others are drawn all the same.
     """
-    from physjax.files import replacing
+    from physjax.files import write_atomically
 
     cards: list[str] = []
     for name in names:
         error = None
         try:
-            cards.append(_card(_draw(name, folder)))
+            cards.append(_render_card(_draw_scene(name, folder)))
         except Exception as reason:  # whatever it is, it is handed on, and the next scene is drawn
             error = reason
-            cards.append(_card(Entry(name, title(name), "", f"could not be drawn: {reason}"), drawn=False))
+            cards.append(_render_card(Entry(name, title(name), "", f"could not be drawn: {reason}"), drawn=False))
         yield name, error
-    with replacing(folder / "index.html") as file:
+    with write_atomically(folder / "index.html") as file:
         file.write(_PAGE.replace("__CARDS__", "\n".join(cards)))
 
 
-def _draw(name: str, folder: Path) -> Entry:
+def _draw_scene(name: str, folder: Path) -> Entry:
     """Run a scene as its own reference and write both pictures."""
     from matplotlib import pyplot as plt
 
-    from physjax.files import replacing
+    from physjax.files import write_atomically
     from physjax.show import auto_plot
 
-    told, problem = entry(name)
+    record, problem = describe_scene(name)
     run = problem.filmed()
-    figure = auto_plot.still(run, problem.looks)
-    with replacing(folder / f"{name}.png", "wb") as file:
+    figure = auto_plot.plot_run(run, problem.looks)
+    with write_atomically(folder / f"{name}.png", "wb") as file:
         figure.savefig(file, dpi=125, bbox_inches="tight")
     plt.close(figure)
-    auto_plot.moving(run, problem.looks).save(folder / f"{name}.gif", progress=False)
-    return told
+    auto_plot.animate_run(run, problem.looks).save(folder / f"{name}.gif", progress=False)
+    return record
 
 
-def _size(problem: Problem) -> str:
+def _describe_size(problem: Problem) -> str:
     """How many of what, in how many dimensions, and for how long."""
-    from physjax.text import seconds_text
+    from physjax.text import format_seconds
 
     state, forces = problem.scene.state, problem.scene.forces
     lanes = state.position[..., 0].size
@@ -85,11 +85,11 @@ def _size(problem: Problem) -> str:
     words = f"{lanes} {one if lanes == 1 else many}"
     springs = sum(len(force.pairs) for force in forces if isinstance(force, Springs))
     joined = f", {springs} spring{'s' * (springs > 1)}" if springs else ""
-    return f"{words} in {state.position.shape[-1]}-D{joined}, {seconds_text(problem.duration)}"
+    return f"{words} in {state.position.shape[-1]}-D{joined}, {format_seconds(problem.duration)}"
 
 
-def _card(told: Entry, drawn: bool = True) -> str:
-    name, line, size, truth = map(html.escape, told)
+def _render_card(record: Entry, drawn: bool = True) -> str:
+    name, line, size, truth = map(html.escape, record)
     picture = (
         f'<button aria-label="play or stop {name}"><img src="{name}.png" data-other="{name}.gif" alt="{line}" '
         'loading="lazy"></button>'

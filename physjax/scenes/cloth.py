@@ -55,7 +55,7 @@ def hanging_rope(
             Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-6),
             Truth(
                 "the nails carry its weight, but for the shares that rest on them [N]",
-                _carried,
+                _measure_pinned_load,
                 mass * g * (nodes - 2) / (nodes - 1),
                 1e-6,
             ),
@@ -107,7 +107,7 @@ def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float
         looks=sheet,
         truths=(
             Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 2e-6),
-            Truth("the nails carry the weight of the rest [N]", _carried, weight, 1e-6),
+            Truth("the nails carry the weight of the rest [N]", _measure_pinned_load, weight, 1e-6),
             Truth(
                 "left and right mirror each other [m]",
                 lambda f: f.position - f.position[:, mirrored] * [-1.0, 1.0, 1.0],
@@ -142,12 +142,12 @@ def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) ->
             Truth("stays on its pole [m]", lambda f: f.position[:, pole] - f.position[0, pole], 0.0, 0.0),
             Truth(
                 "no thread is stretched by more than a tenth [1]",
-                lambda f: np.maximum(_strain(f.scene.forces[1], _states(f)), 0.0),
+                lambda f: np.maximum(_strain(f.scene.forces[1], _stack_states(f)), 0.0),
                 0.0,
                 0.1,
             ),
-            Truth("momentum is what air, weight and pole gave [kg m/s]", _momentum_gap, 0.0, 2e-3),
-            Truth("energy is what the air gave, less what the threads lost [J]", _energy_gap, 0.0, 1e-3),
+            Truth("momentum is what air, weight and pole gave [kg m/s]", _momentum_residual, 0.0, 2e-3),
+            Truth("energy is what the air gave, less what the threads lost [J]", _energy_residual, 0.0, 1e-3),
             Truth(
                 "flies downwind: the free edge is far from the pole [m]",
                 lambda f: f.position[-1, sheet.nodes["right"], 0].mean(),
@@ -180,7 +180,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
         forces=(forces.Gravity(g), sheet.springs, forces.StokesDrag(6.0 * sheet.mass)),
         contacts=(ball, floor),
     )
-    into = lambda which: lambda f: np.minimum(_gap(f.scene.contacts[which], f.position), 0.0)  # noqa: E731
+    into = lambda which: lambda f: np.minimum(_signed_distance(f.scene.contacts[which], f.position), 0.0)  # noqa: E731
     return Problem(
         falling,
         duration=3.0,
@@ -205,46 +205,46 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
     )
 
 
-def _carried(flight):
+def _measure_pinned_load(flight):
     """Vertical force of the springs on what is pinned, at the end [N], downwards positive."""
-    pull = _terms(flight)[1][-1]
+    pull = _evaluate_terms(flight)[1][-1]
     return -np.sum(pull[np.asarray(flight.scene.pinned), 1])
 
 
-def _states(flight):
+def _stack_states(flight):
     """All frames of a flight as one state."""
     return Particles(flight.position, flight.velocity)
 
 
 # compiled once, instead of operation by operation
 _strain = jax.jit(lambda springs, states: springs.strain(states))
-_gap = jax.jit(lambda contact, position: contact.gap(0.0, position))
+_signed_distance = jax.jit(lambda contact, position: contact.signed_distance(0.0, position))
 _loads = jax.jit(jax.vmap(lambda scene, state: loads(scene, 0.0, state, per_term=True), (None, 0)))
 _energies = jax.jit(jax.vmap(lambda scene, state: total(scene, 0.0, state), (None, 0)))
 
 
-def _terms(flight, still=False):
+def _evaluate_terms(flight, still=False):
     """The force of each term of the scene on each node at every frame [N]; of nodes that do not move, if so told."""
-    states = _states(flight)
+    states = _stack_states(flight)
     states = states._replace(velocity=0.0 * states.velocity) if still else states
     return [np.asarray(term) for term in _loads(flight.scene, states)]
 
 
-def _momentum_gap(flight):
+def _momentum_residual(flight):
     """Change of momentum from start to end, less the impulse of all forces on what is free [kg m/s]."""
     mass, free = np.asarray(flight.scene.mass)[:, None], ~np.asarray(flight.scene.pinned)
     change = np.sum(mass * (flight.velocity[-1] - flight.velocity[0]), axis=0)
-    return change - _integral(flight.time, sum(_terms(flight))[:, free].sum(axis=1))
+    return change - _integrate(flight.time, sum(_evaluate_terms(flight))[:, free].sum(axis=1))
 
 
-def _energy_gap(flight):
+def _energy_residual(flight):
     """Change of energy from start to end, less the work of the air and of the springs' damping [J]."""
-    energy = np.asarray(_energies(flight.scene, _states(flight)))
-    (_, pull, push), (_, elastic, _) = _terms(flight), _terms(flight, still=True)
+    energy = np.asarray(_energies(flight.scene, _stack_states(flight)))
+    (_, pull, push), (_, elastic, _) = _evaluate_terms(flight), _evaluate_terms(flight, still=True)
     power = np.sum((push + pull - elastic) * flight.velocity, axis=(1, 2))
-    return energy[-1] - energy[0] - _integral(flight.time, power)
+    return energy[-1] - energy[0] - _integrate(flight.time, power)
 
 
-def _integral(time, rate):
+def _integrate(time, rate):
     """The integral over the whole time, by Simpson's rule."""
     return (time[1] - time[0]) / 3 * (rate[:-2:2] + 4 * rate[1:-1:2] + rate[2::2]).sum(axis=0)

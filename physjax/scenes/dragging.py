@@ -17,7 +17,7 @@ from physjax.scene import Scene
 from physjax.scenes.registry import scene
 from physjax.show import solids
 from physjax.study.problem import Problem, Truth
-from physjax.vectors import over, scale
+from physjax.vectors import broadcast_vector, scale
 
 LIMBS = {
     # mass [kg], radius and length between the ends of its axis [m], where its middle lies along x and z [m]
@@ -32,7 +32,7 @@ LIMBS = {
     "other thigh": (8.0, 0.075, 0.3, -0.5, -0.1),
     "other shin": (4.0, 0.055, 0.34, -0.92, -0.1),
 }
-JOINED = (
+JOINT_PLACES = (
     # which two, and where along x and z [m]
     ("torso", "head", 0.31, 0.0),
     ("torso", "arm", 0.18, 0.2),
@@ -46,7 +46,7 @@ JOINED = (
 )
 
 
-class Lead(Force):
+class TowSpring(Force):
     """A damped spring to a place that sets out softly: F = k (X - x) + c (X' - v), X = X₀ + U (t - τ(1 - e^(-t/τ)))."""
 
     couples: ClassVar[bool] = False
@@ -59,8 +59,8 @@ class Lead(Force):
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The pull [N]."""
         (x, v), begun = state, 1 - jnp.exp(-t / self.soft)
-        place = over(self.start, x) + scale(t - self.soft * begun, over(self.velocity, v))
-        slip = scale(begun, over(self.velocity, v)) - v
+        place = broadcast_vector(self.start, x) + scale(t - self.soft * begun, broadcast_vector(self.velocity, v))
+        slip = scale(begun, broadcast_vector(self.velocity, v)) - v
         return scale(self.stiffness, place - x) + scale(self.damping, slip)
 
 
@@ -76,20 +76,22 @@ def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Proble
     middle = np.stack([x, np.full_like(x, height), z], axis=-1)
     moments = [inertia.capsule(*limb, axis=0).principal for limb in zip(mass, radius, length, strict=True)]
     limbs = inertia.Inertia(mass, jnp.stack(moments))
-    pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINED])
-    where = np.array([[x, height, z] for *_, x, z in JOINED])
+    pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINT_PLACES])
+    where = np.array([[x, height, z] for *_, x, z in JOINT_PLACES])
     joints = rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0)
-    led = np.array(names) == "forearm"
-    hand = np.array([length[led][0] / 2, 0.0, 0.0])
-    lead = Lead(middle[led][0] + hand, (speed, 0.0, 0.0), soft=0.3, stiffness=1e4 * led, damping=500.0 * led)
+    towed = np.array(names) == "forearm"
+    hand = np.array([length[towed][0] / 2, 0.0, 0.0])
+    tow_spring = TowSpring(
+        middle[towed][0] + hand, (speed, 0.0, 0.0), soft=0.3, stiffness=1e4 * towed, damping=500.0 * towed
+    )
     ends = np.multiply.outer(length, [[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
     rough = contacts.Coulomb(friction, friction)
     ground = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0, coulomb=rough)
     dragged = Scene(
         rigid.bodies(limbs, middle),
         limbs,
-        (forces.Gravity(g), joints, rigid.AtPoint(hand, lead)),
-        (rigid.Touch(rigid.Hull(ends, radius), ground),),
+        (forces.Gravity(g), joints, rigid.AtPoint(hand, tow_spring)),
+        (rigid.SurfaceContact(rigid.ContactPoints(ends, radius), ground),),
     )
     duration, frames = 4.0, 64
 
@@ -102,8 +104,8 @@ def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Proble
 
     def pull(flight):
         state = jax.tree.map(jnp.asarray, flight.state)
-        force = jax.vmap(lambda t, state: rigid.AtPoint(hand, lead)(t, state, limbs).force)(flight.time, state)
-        along, up, _ = np.asarray(force)[frames // 2 :, led].mean(axis=(0, 1))
+        force = jax.vmap(lambda t, state: rigid.AtPoint(hand, tow_spring)(t, state, limbs).force)(flight.time, state)
+        along, up, _ = np.asarray(force)[frames // 2 :, towed].mean(axis=(0, 1))
         return along / (friction * (mass.sum() * g - up))
 
     return Problem(

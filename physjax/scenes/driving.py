@@ -12,24 +12,24 @@ from physjax.checks import quantity
 from physjax.physics import contacts, forces, rigid
 from physjax.physics.rigid import inertia
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import in_world
+from physjax.physics.rigid.spatial import to_world_frame
 from physjax.scene import Scene
 from physjax.scenes.registry import scene
 from physjax.show import solids
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
-from physjax.vectors import cross, dot, norm, scale, stacked, unit
+from physjax.vectors import cross, dot, norm, scale, stack_components, unit
 
-SIZE = np.array([3.0, 1.0, 1.7])
-PARTS = [
+BODY_SIZE = np.array([3.0, 1.0, 1.7])
+BODY_PARTS = [
     # size and place [m] of what the body is made of
     (np.array([3.0, 0.55, 1.7]), np.array([0.0, -0.225, 0.0])),
     (np.array([1.6, 0.45, 1.5]), np.array([0.0, 0.275, 0.0])),
 ]
-MOUNTS = np.array([[x, -0.3, z] for x in (-1.3, 1.3) for z in (-0.7, 0.7)])
-WHEEL = 0.35
+WHEEL_MOUNTS = np.array([[x, -0.3, z] for x in (-1.3, 1.3) for z in (-0.7, 0.7)])
+WHEEL_RADIUS = 0.35
 AHEAD, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-FALLEN = 0.2
+MIN_UP_COSINE = 0.2
 """Of a car that leans so far that less than this of its own up points upwards, no wheel is under it."""
 
 
@@ -51,29 +51,29 @@ class Suspension(rigid.Load):
 
     def wrench(self, t: ArrayLike, bodies: rigid.RigidBodies, inertia: Inertia) -> rigid.Wrench:
         """The force of each tyre where it touches, and its torque."""
-        ahead, up = (in_world(bodies, axis) for axis in (AHEAD, UP))
+        ahead, up = (to_world_frame(bodies, axis) for axis in (AHEAD, UP))
         velocity, omega = scale(1 / inertia.mass, bodies.momentum), rigid.angular_velocity(bodies, inertia)
 
         def wheel(mount):
-            reach = rigid.point(bodies, mount)[..., 1] / jnp.maximum(up[..., 1], FALLEN)
-            low = in_world(bodies, mount) - scale(reach, up)
-            pressed = jnp.where(up[..., 1] > FALLEN, jnp.maximum(self.length - reach, 0.0), 0.0)
-            force = self._tyre(t, pressed, velocity + cross(omega, low), ahead)
+            reach = rigid.point(bodies, mount)[..., 1] / jnp.maximum(up[..., 1], MIN_UP_COSINE)
+            low = to_world_frame(bodies, mount) - scale(reach, up)
+            pressed = jnp.where(up[..., 1] > MIN_UP_COSINE, jnp.maximum(self.length - reach, 0.0), 0.0)
+            force = self._tyre_force(t, pressed, velocity + cross(omega, low), ahead)
             return rigid.Wrench(force, cross(low, force))
 
-        return jax.tree.map(sum, jax.vmap(wheel)(jnp.asarray(MOUNTS, bodies.dtype)))
+        return jax.tree.map(sum, jax.vmap(wheel)(jnp.asarray(WHEEL_MOUNTS, bodies.dtype)))
 
-    def _tyre(self, t: ArrayLike, pressed: Array, speed: Array, ahead: Array) -> Array:
+    def _tyre_force(self, t: ArrayLike, pressed: Array, speed: Array, ahead: Array) -> Array:
         push = jnp.where(pressed > 0, self.stiffness * pressed - self.damping * speed[..., 1], 0.0)
         push, none = jnp.maximum(push, 0.0), jnp.zeros_like(push)
-        ahead = unit(stacked([ahead[..., 0], none, ahead[..., 2]]))
-        aside = stacked([-ahead[..., 2], none, ahead[..., 0]])
+        ahead = unit(stack_components([ahead[..., 0], none, ahead[..., 2]]))
+        aside = stack_components([-ahead[..., 2], none, ahead[..., 0]])
         stops = -self.brake * jnp.tanh(dot(speed, ahead) / 0.1)  # without a jump where the car stands
-        drive = jnp.where(t < self.brakes_at, self.throttle, stops) / len(MOUNTS)
+        drive = jnp.where(t < self.brakes_at, self.throttle, stops) / len(WHEEL_MOUNTS)
         pull = scale(drive, ahead) - scale(self.grip * dot(speed, aside), aside)
         size, most = norm(pull), self.friction * push
         pull = scale(jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0), pull)
-        return pull + stacked([none, push, none])
+        return pull + stack_components([none, push, none])
 
 
 class Kerb(contacts.Surface):
@@ -82,21 +82,21 @@ class Kerb(contacts.Surface):
     at: Float[Array, "..."] = quantity("place of the face", "m")
     height: Float[Array, "..."] = quantity("height", "m", above=0)
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
         """Distance to the nearest of ground, face, top and edge [m]."""
-        before, above = self._sides(position)
-        edge = norm(stacked([before, above]))
+        before, above = self._face_distances(position)
+        edge = norm(stack_components([before, above]))
         kerb = jnp.where((before > 0) & (above > 0), edge, jnp.maximum(before, above))
         return jnp.minimum(position[..., 1], kerb)
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
         """Away from the nearest."""
-        before, above = self._sides(position)
-        low = position[..., 1] <= self.gap(t, position)
+        before, above = self._face_distances(position)
+        low = position[..., 1] <= self.signed_distance(t, position)
         edge, face = ~low & (before > 0) & (above > 0), ~low & (before > above)
         x = jnp.where(edge, before, jnp.where(face, 1.0, 0.0))
         y = jnp.where(edge, above, jnp.where(face, 0.0, 1.0))
-        return unit(stacked([-x, y, jnp.zeros_like(x)]))
+        return unit(stack_components([-x, y, jnp.zeros_like(x)]))
 
     def profile(self, low: float, high: float) -> np.ndarray:
         """The line in the plane of x and y between two places along x [m], the same at every z."""
@@ -105,7 +105,7 @@ class Kerb(contacts.Surface):
             return np.array([[low, height * (at <= low)], [high, height * (at <= low)]])
         return np.array([[low, 0.0], [at, 0.0], [at, height], [high, height]])
 
-    def _sides(self, position: Array) -> tuple[Array, Array]:
+    def _face_distances(self, position: Array) -> tuple[Array, Array]:
         return self.at - position[..., 0], position[..., 1] - self.height
 
 
@@ -117,10 +117,10 @@ def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
     hubs to the centre of mass and I of the pitch. A body is as heavy and as hard to turn as the box around it.
     """
     mass, stiffness, length, restitution = 1200.0, 6e4, 0.55, 0.4
-    body = inertia.box(mass, SIZE)
+    body = inertia.box(mass, BODY_SIZE)
     sag = mass * g / (4 * stiffness)
-    height = length - sag - MOUNTS[0, 1]
-    low = height - WHEEL
+    height = length - sag - WHEEL_MOUNTS[0, 1]
+    low = height - WHEEL_RADIUS
     start = rigid.bodies(
         body,
         [[0.0, height + 0.1, -7.0], [0.0, height, -3.5], [6.0, height, 0.5], [8.0, height, 5.0]],
@@ -138,16 +138,16 @@ def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
         grip=1e4,
         friction=friction,
     )
-    hubs = MOUNTS * [1.0, 0.0, 1.0] - low * np.array(UP)
-    corners = np.concatenate([_corners(size) + place for size, place in PARTS])
-    outer = np.isclose(np.abs(corners[:, 1]), SIZE[1] / 2)
+    hubs = WHEEL_MOUNTS * [1.0, 0.0, 1.0] - low * np.array(UP)
+    corners = np.concatenate([_corners(size) + place for size, place in BODY_PARTS])
+    outer = np.isclose(np.abs(corners[:, 1]), BODY_SIZE[1] / 2)
     step, rough = (13.0, 0.4), contacts.Coulomb(0.5, 0.5)
     touches = (
-        rigid.Touch(rigid.Hull(corners[outer]), Kerb(*step, restitution=0.2, coulomb=rough)),
-        rigid.Touch(rigid.Hull(hubs, 0.3), Kerb(*step, restitution=restitution)),
+        rigid.SurfaceContact(rigid.ContactPoints(corners[outer]), Kerb(*step, restitution=0.2, coulomb=rough)),
+        rigid.SurfaceContact(rigid.ContactPoints(hubs, 0.3), Kerb(*step, restitution=restitution)),
     )
-    parts = [solids.box(size).at(place) for size, place in PARTS]
-    parts += [solids.cylinder(WHEEL, 0.25).at(hub) for hub in hubs]
+    parts = [solids.box(size).at(place) for size, place in BODY_PARTS]
+    parts += [solids.cylinder(WHEEL_RADIUS, 0.25).at(hub) for hub in hubs]
     duration, frames = 5.0, 100
     brakes = round(frames * brakes_at / duration)
     gained = throttle / mass * duration / frames * (brakes - 1)
@@ -165,7 +165,10 @@ def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
         duration,
         truths=(
             Truth(
-                "one rests at the sag mg/(4k) [m]", lambda f: length - MOUNTS[0, 1] - f.position[-1, 0, 1], sag, 1e-9
+                "one rests at the sag mg/(4k) [m]",
+                lambda f: length - WHEEL_MOUNTS[0, 1] - f.position[-1, 0, 1],
+                sag,
+                1e-9,
             ),
             Truth("one drives as fast as Ft/m [relative]", lambda f: pace(f, brakes - 1, 1) / gained, 1.0, 1e-6),
             Truth("and brakes within v²/(2μg) [relative]", way, 1.0, 0.02),
@@ -175,8 +178,8 @@ def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
                 1 - (1 + restitution) / (1 + lever),
                 1e-6,
             ),
-            Truth("one flips: its up points down in the end [1]", lambda f: _up(f)[-1, 3], -1.0, 0.01),
-            Truth("the others never lean far [1]", lambda f: _up(f)[:, :3], 1.0, 0.05),
+            Truth("one flips: its up points down in the end [1]", lambda f: _up_component(f)[-1, 3], -1.0, 0.01),
+            Truth("the others never lean far [1]", lambda f: _up_component(f)[:, :3], 1.0, 0.05),
         ),
         looks=parts[0].joined(*parts[1:]),
         frames=frames,
@@ -188,7 +191,7 @@ def _corners(size: np.ndarray) -> np.ndarray:
     return np.array(list(product((-0.5, 0.5), repeat=3))) * size
 
 
-def _up(flight: Trajectory) -> np.ndarray:
+def _up_component(flight: Trajectory) -> np.ndarray:
     """How much of each car's up points upwards, at every frame: 1 - 2(x² + z²) of its quaternion."""
     _, x, _, z = np.moveaxis(flight.state.orientation, -1, 0)
     return 1 - 2 * (x * x + z * z)

@@ -42,52 +42,52 @@ class Failure(NamedTuple):
 @failure
 def euler_on_a_spring(dt: float = 0.1) -> Failure:
     """Explicit Euler on a spring without damping: the swing grows √(1 + ω²dt²) times a step, at any step."""
-    return Failure(_spring(), methods.euler, dt, 1200, "stiffness", "Anchor", 0.0)
+    return Failure(_build_spring(), methods.euler, dt, 1200, "stiffness", "Anchor", 0.0)
 
 
 @failure
 def midpoint_on_a_spring(dt: float = 0.1) -> Failure:
     """Midpoint on the same spring: the swing grows √(1 + ω⁴dt⁴/4) times a step, slowly, and for ever."""
-    return Failure(_spring(), methods.midpoint, dt, 1200, "stiffness", "Anchor", 0.0)
+    return Failure(_build_spring(), methods.midpoint, dt, 1200, "stiffness", "Anchor", 0.0)
 
 
 @failure
 def semi_implicit_beyond_two(beyond: float = 1.01) -> Failure:
     """Semi-implicit Euler with ω dt a little over 2: bounded until there, gone beyond."""
     limit = 2 / OMEGA
-    return Failure(_spring(), methods.semi_implicit_euler, beyond * limit, 1200, "stiffness", "Anchor", limit)
+    return Failure(_build_spring(), methods.semi_implicit_euler, beyond * limit, 1200, "stiffness", "Anchor", limit)
 
 
 @failure
 def rk4_beyond_two_root_two(beyond: float = 1.01) -> Failure:
     """Runge-Kutta with ω dt a little over 2√2, where it stops to lose energy and begins to gain it."""
     limit = 2 * np.sqrt(2.0) / OMEGA
-    return Failure(_spring(), methods.rk4, beyond * limit, 1200, "stiffness", "Anchor", limit)
+    return Failure(_build_spring(), methods.rk4, beyond * limit, 1200, "stiffness", "Anchor", limit)
 
 
 @failure
 def euler_on_a_damped_spring(dt: float = 7e-3) -> Failure:
     """Explicit Euler with k = 15, b = 0.1, m = 1: the friction of 0.1 makes steps up to b/k = 6.67 ms stable, no more."""
-    return Failure(_spring(0.1), methods.euler, dt, 1200, "stiffness", "Anchor", 0.1 / 15)
+    return Failure(_build_spring(0.1), methods.euler, dt, 1200, "stiffness", "Anchor", 0.1 / 15)
 
 
 @failure
 def semi_implicit_on_a_damped_spring(dt: float = 0.515) -> Failure:
     """Semi-implicit Euler on the same spring: k dt² + 2b dt < 4 is 509.8 ms, seventy times explicit Euler's step."""
     limit = (np.sqrt(0.1**2 + 4 * 15.0) - 0.1) / 15.0
-    return Failure(_spring(0.1), methods.semi_implicit_euler, dt, 1200, "stiffness", "Anchor", limit)
+    return Failure(_build_spring(0.1), methods.semi_implicit_euler, dt, 1200, "stiffness", "Anchor", limit)
 
 
 @failure
 def stiff_cloth(dt: float = 8e-3) -> Failure:
     """A cloth of 1000 N/m at 0.1 kg a node: without damping 7 ms are stable under semi-implicit Euler, 8 are not."""
-    return Failure(_cloth(None), methods.semi_implicit_euler, dt, 1200, "stiffness", "Springs", None)
+    return Failure(_build_cloth(None), methods.semi_implicit_euler, dt, 1200, "stiffness", "Springs", None)
 
 
 @failure
 def damped_cloth(dt: float = 4e-3) -> Failure:
     """The same cloth with damping, put in to make it calm: now the damping sets the limit, 2.2 ms."""
-    return Failure(_cloth(10.0), methods.semi_implicit_euler, dt, 1200, "damping", "Springs", None)
+    return Failure(_build_cloth(10.0), methods.semi_implicit_euler, dt, 1200, "damping", "Springs", None)
 
 
 @failure
@@ -121,14 +121,14 @@ def blind_throw() -> Failure:
     return Failure(scene, blind, 2.0, 1, "error measure", "", None)
 
 
-def _spring(drag: float | None = None) -> Scene:
+def _build_spring(drag: float | None = None) -> Scene:
     parts = () if drag is None else (forces.StokesDrag(drag),)
     return Scene(
         Particles(jnp.ones(1), jnp.zeros(1)), forces=(forces.Anchor(point=jnp.zeros(1), stiffness=15.0), *parts)
     )
 
 
-def _cloth(damping: float | None) -> Scene:
+def _build_cloth(damping: float | None) -> Scene:
     stiff = {"structural": 1e3, "shear": 1e3, "bend": 1e3, "damping": damping}
     sheet = lattices.cloth(0.4, 0.4, 5, 5, mass=2.5, down=(0, 0, 1), **stiff)
     pinned = sheet.nodes["top"] & sheet.nodes["corners"]

@@ -7,7 +7,7 @@ from physjax import projectile as closed_form
 from physjax.particles import Particles
 from physjax.physics import forces
 from physjax.scene import Scene
-from physjax.scenes.registry import scene, table
+from physjax.scenes.registry import read_table, scene
 from physjax.study.energy.quantities import ENERGY
 from physjax.study.problem import Problem, Truth
 
@@ -69,7 +69,7 @@ def raindrop() -> Problem:
 
     The drag correction grows as |v|^1.681 from rest, so no method is better than order 2.7 here, whatever it promises.
     """
-    measured = table("raindrop_terminal_velocity.csv")
+    measured = read_table("raindrop_terminal_velocity.csv")
     radius = measured["diameter_mm"] / 2000
     volume = 4 / 3 * np.pi * radius**3
     drops = Scene(

@@ -6,7 +6,7 @@ import numpy as np
 from physjax.particles import Particles
 from physjax.physics import forces
 from physjax.scene import Scene
-from physjax.scenes.registry import scene, table
+from physjax.scenes.registry import read_table, scene
 from physjax.study.energy.quantities import ANGULAR_MOMENTUM, ENERGY, MOMENTUM
 from physjax.study.problem import Problem, Truth
 
@@ -28,7 +28,7 @@ def kepler(eccentricity: float = 0.9, orbits: int = 2) -> Problem:
     )
 
     def exact(t):
-        anomaly = _eccentric_anomaly(np.asarray(t, float), e)[:, None, None]
+        anomaly = _solve_kepler(np.asarray(t, float), e)[:, None, None]
         rate = 1 / (1 - e * np.cos(anomaly))
         minor = np.sqrt(1 - e**2)
         relative = np.concatenate([np.cos(anomaly) - e, minor * np.sin(anomaly)], axis=-1)
@@ -80,7 +80,7 @@ def figure_eight() -> Problem:
 @scene
 def solar_system() -> Problem:
     """Sun, planets and Pluto for ten years from JPL's DE421 positions, by Newton's gravitation alone."""
-    ephemeris = table("solar_system_de421.csv")
+    ephemeris = read_table("solar_system_de421.csv")
     dates = ephemeris["julian_date_tdb"]
     start, end = dates == dates.min(), dates == dates.max()
     position = np.stack([ephemeris[c] for c in ("x_m", "y_m", "z_m")], axis=-1)
@@ -114,7 +114,7 @@ def solar_system() -> Problem:
     )
 
 
-def _eccentric_anomaly(mean: np.ndarray, e: float) -> np.ndarray:
+def _solve_kepler(mean: np.ndarray, e: float) -> np.ndarray:
     """Solve Kepler's equation E - e sin E = M by Newton's method from E = π, which converges for every e < 1."""
     turns = np.floor(mean / (2 * np.pi))
     mean = mean - 2 * np.pi * turns

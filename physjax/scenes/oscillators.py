@@ -155,7 +155,7 @@ def floating_ball(radius: float = 0.1, density: float = 400.0, drop: float = 0.3
 
     def weight_displaced(flight):
         shown = Particles(flight.position[-1], flight.velocity[-1])
-        return water * float(dropped.forces[1].displaced(shown))
+        return water * float(dropped.forces[1].displaced_volume(shown))
 
     return Problem(
         dropped,

@@ -66,8 +66,8 @@ def fountain(rate: float = 200.0, speed: float = 6.0, cone: float = 0.5, restitu
         duration=2.0,
         frames=16,
         truths=(
-            *_bounces(g, restitution),
-            _alive(rate * life),
+            *_build_bounce_truths(g, restitution),
+            _build_alive_truth(rate * life),
         ),
     )
 
@@ -85,8 +85,8 @@ def smoke(rate: float = 150.0, rise: float = 1.2, eddies: float = 0.3) -> Proble
         size=0.05,
         look=emitters.Look(size=(1.0, 4.0), colour=((0.3, 0.3, 0.3), (0.7, 0.7, 0.7)), opacity=(0.6, 0.0)),
     )
-    puffs, rises = _hot_gas(plume, rise, 0.02, eddies, 0.8)
-    return Problem(puffs, duration=3.0, frames=16, truths=(rises, _alive(rate * life)))
+    puffs, rises = _build_hot_gas(plume, rise, 0.02, eddies, 0.8)
+    return Problem(puffs, duration=3.0, frames=16, truths=(rises, _build_alive_truth(rate * life)))
 
 
 @scene
@@ -107,14 +107,14 @@ def fire(rate: float = 400.0, rise: float = 1.5, eddies: float = 0.3) -> Problem
             glows=True,
         ),
     )
-    gas, rises = _hot_gas(flame, rise, 0.01, eddies, 0.5)
+    gas, rises = _build_hot_gas(flame, rise, 0.01, eddies, 0.5)
 
     def light(flight):
         return np.sum(flight.final_scene.emitter.appearance(flight.time[-1]).opacity)
 
     mean = np.mean((np.asarray(brightness[1:]) + np.asarray(brightness[:-1])) / 2)
     steady = Truth("as much light as is given off in a life [1]", light, rate * life * mean, max(brightness))
-    return Problem(gas, duration=1.6, frames=16, truths=(rises, steady, _alive(rate * life)))
+    return Problem(gas, duration=1.6, frames=16, truths=(rises, steady, _build_alive_truth(rate * life)))
 
 
 @scene
@@ -146,7 +146,7 @@ def sparks(rate: float = 250.0, speed: float = 3.0, restitution: float = 0.5, co
         return np.abs(np.asarray(seen.opacity) - np.exp(-np.asarray(emitter.age(now)) / cooling))[seen.alive].max()
 
     cools = Truth("cools as e^(-t/τ) [1]", off_newton, 0.0, float(ages[1] / cooling) ** 2 / 8)
-    truths = (*_bounces(g, restitution, height), cools, _alive(rate * life))
+    truths = (*_build_bounce_truths(g, restitution, height), cools, _build_alive_truth(rate * life))
     return Problem(flying, duration=2.0, frames=16, truths=truths)
 
 
@@ -171,7 +171,7 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
 
     def off_the_way(flight):
         """Flakes are born at their terminal speed, and take m/b to go with the wind."""
-        age, _ = _newest(flight)
+        age, _ = _read_ages(flight)
         emitter = flight.final_scene.emitter
         start = np.asarray(emitter.births(emitter.slot, emitter.generation).position)
         down = np.minimum(age, start[:, 1] / fall)
@@ -191,23 +191,23 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
                 0.0,
                 1e-8,
             ),
-            _alive(rate * life),
+            _build_alive_truth(rate * life),
         ),
     )
 
 
-def _newest(flight: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def _read_ages(flight: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Age [s] of the particles alive at the end, 0 of all others, and the velocity each was born with [m/s]."""
     emitter, now = flight.final_scene.emitter, flight.time[-1]
     age = np.where(emitter.alive(now), emitter.age(now), 0.0)
     return age, np.asarray(emitter.births(emitter.slot, emitter.generation).velocity)
 
 
-def _bounces(g: float, restitution: float, height: float = 0.0) -> tuple[Truth, Truth]:
+def _build_bounce_truths(g: float, restitution: float, height: float = 0.0) -> tuple[Truth, Truth]:
     """What is thrown from a height [m] and bounces without friction goes on over the ground; upwards it flies twice."""
 
     def seen(flight):
-        age, velocity = _newest(flight)
+        age, velocity = _read_ages(flight)
         return age, velocity, np.asarray(flight.position[-1])
 
     def off_the_line(flight):
@@ -229,7 +229,9 @@ def _bounces(g: float, restitution: float, height: float = 0.0) -> tuple[Truth, 
     )
 
 
-def _hot_gas(emitter: emitters.Emitter, rise: float, lag: float, eddies: float, width: float) -> tuple[Scene, Truth]:
+def _build_hot_gas(
+    emitter: emitters.Emitter, rise: float, lag: float, eddies: float, width: float
+) -> tuple[Scene, Truth]:
     """What buoyancy lifts through the air at `rise` [m/s], `lag` [s] behind eddies of a speed [m/s] and width [m]."""
     g, mass = 9.8, 1e-6
     drag = mass / lag
@@ -239,7 +241,7 @@ def _hot_gas(emitter: emitters.Emitter, rise: float, lag: float, eddies: float, 
     loads = (forces.Gravity(g), forces.Buoyancy(1.225, volume), forces.StokesDrag(drag), stirring)
 
     def rising(flight):
-        age, _ = _newest(flight)
+        age, _ = _read_ages(flight)
         flow = np.asarray(stirring.flow(flight.time[-1], jnp.asarray(flight.position[-1])))
         return np.mean((np.asarray(flight.velocity[-1]) - flow)[age > 10 * lag, 1])
 
@@ -248,7 +250,7 @@ def _hot_gas(emitter: emitters.Emitter, rise: float, lag: float, eddies: float, 
     return Scene(emitter.unborn(), mass, loads, emitter=emitter), rises
 
 
-def _alive(expected: float) -> Truth:
+def _build_alive_truth(expected: float) -> Truth:
     """In the steady state the number alive is rate times life."""
 
     def count(flight):

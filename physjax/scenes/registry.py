@@ -53,7 +53,7 @@ def title(name: str) -> str:
     return (SCENES | FAILURES)[name].__doc__.strip().splitlines()[0]
 
 
-def table(file: str) -> dict[str, np.ndarray]:
+def read_table(file: str) -> dict[str, np.ndarray]:
     """A CSV file of measurements that is shipped with the package, column by column."""
     path = resources.files("physjax.scenes") / "data" / file
     with path.open(encoding="utf-8") as lines:
@@ -61,7 +61,7 @@ def table(file: str) -> dict[str, np.ndarray]:
     return {name: rows[name] for name in rows.dtype.names}
 
 
-__all__ = ["FAILURES", "SCENES", "failure", "scene", "table", "title"]
+__all__ = ["FAILURES", "SCENES", "failure", "read_table", "scene", "title"]
 
 
 def __dir__() -> list[str]:

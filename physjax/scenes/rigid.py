@@ -12,9 +12,9 @@ from physjax.show import solids
 from physjax.study.energy.quantities import ANGULAR_MOMENTUM, ENERGY
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
-from physjax.vectors import composed, turn, turn_back, turned
+from physjax.vectors import multiply_quaternions, rotate_components, rotate_vector, rotate_vector_back
 
-UP, OWN = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+UP, BODY_AXIS = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 @scene
@@ -32,7 +32,9 @@ def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
     thrown = Scene(rigid.bodies(disc, velocity=velocity, angular_velocity=(wobble, 0.0, spin)), disc)
 
     def exact(t):
-        q = composed(_about(momentum / size, size / i1 * t), _about(OWN, -slip * t))
+        q = multiply_quaternions(
+            _axis_quaternion(momentum / size, size / i1 * t), _axis_quaternion(BODY_AXIS, -slip * t)
+        )
         path = np.multiply.outer(t, velocity)
         kept = (np.broadcast_to(a, path.shape) for a in (mass * velocity, momentum))
         return rigid.RigidBodies(path, np.stack(q, axis=-1), *kept)
@@ -46,7 +48,7 @@ def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
         truths=(
             Truth(
                 "seen from the disc, ω goes round at (I₃ - I₁)ω₃/I₁ [relative]",
-                lambda flight: _rate(_seen(flight)[..., :2], flight.time) / slip,
+                lambda flight: _turn_rate(_body_angular_velocity(flight)[..., :2], flight.time) / slip,
                 1.0,
                 1e-8,
             ),
@@ -68,18 +70,20 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
     pace = (i3 * spin + np.array([-1.0, 1.0]) * root) / (2 * i1 * np.cos(tilt))
     own = spin - pace * np.cos(tilt)
     axis = np.array([np.sin(tilt), np.cos(tilt), 0.0])
-    start = _leaning(tilt)
+    start = _tilt_quaternion(tilt)
     omega = np.outer(pace, UP) + np.outer(own, axis)
     place = length * axis + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.4]])
     tops = Scene(rigid.bodies(top, place, np.stack(start), angular_velocity=omega), top, (forces.Gravity(g),))
 
     def exact(t):
-        round_about = _about(UP, np.multiply.outer(t, pace))
-        q = composed(composed(round_about, start), _about(OWN, np.multiply.outer(t, own)))
-        arm = np.stack(turned(round_about, list(length * axis)), axis=-1)
+        round_about = _axis_quaternion(UP, np.multiply.outer(t, pace))
+        q = multiply_quaternions(
+            multiply_quaternions(round_about, start), _axis_quaternion(BODY_AXIS, np.multiply.outer(t, own))
+        )
+        arm = np.stack(rotate_components(round_about, list(length * axis)), axis=-1)
         momentum = mass * np.cross(np.outer(pace, UP), arm)
         first = np.outer(i3 * spin * np.ones(2), axis) + i1 * (omega - spin * axis)
-        spins = np.stack(turned(round_about, list(first.T)), axis=-1)
+        spins = np.stack(rotate_components(round_about, list(first.T)), axis=-1)
         return rigid.RigidBodies(arm + place - length * axis, np.stack(q, axis=-1), momentum, spins)
 
     return Problem(
@@ -91,11 +95,11 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
         truths=(
             Truth(
                 "goes round at Ω of the steady precession [relative]",
-                lambda flight: _rate(_axis(flight)[..., [2, 0]], flight.time) / pace,
+                lambda flight: _turn_rate(_body_axis(flight)[..., [2, 0]], flight.time) / pace,
                 1.0,
                 1e-7,
             ),
-            Truth("leans as it did [1]", lambda flight: _axis(flight)[..., 1], np.cos(tilt), 1e-7),
+            Truth("leans as it did [1]", lambda flight: _body_axis(flight)[..., 1], np.cos(tilt), 1e-7),
         ),
         frames=256,
     )
@@ -130,7 +134,7 @@ def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
         truths=(
             Truth(
                 "has turned over after half of the period, and back after all of it [rad/s]",
-                lambda flight: _seen(flight)[[32, 64]][:, order[1]],
+                lambda flight: _body_angular_velocity(flight)[[32, 64]][:, order[1]],
                 np.array([-spin, spin]),
                 1e-6 * spin,
             ),
@@ -153,7 +157,7 @@ def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.
     swing = np.sqrt(float(plank.principal[2]) / (mass * g * arm))
     period = 4 * complete_elliptic(np.sin(amplitude / 2)) * swing
     place = arm * np.array([np.sin(amplitude), -np.cos(amplitude), 0.0])
-    start = np.stack(_about((0.0, 0.0, 1.0), amplitude))
+    start = np.stack(_axis_quaternion((0.0, 0.0, 1.0), amplitude))
     return Problem(
         Scene(rigid.bodies(plank, place, start), plank, (forces.Gravity(g),)),
         duration=float(period),
@@ -180,31 +184,31 @@ def complete_elliptic(k: float) -> float:
     return np.pi / (2 * a)
 
 
-def _about(axis, angle):
+def _axis_quaternion(axis, angle):
     """The quaternion of a turn about a unit vector, in components."""
     half = np.asarray(angle) / 2
     return [np.cos(half), *(part * np.sin(half) for part in axis)]
 
 
-def _leaning(tilt: float) -> list:
+def _tilt_quaternion(tilt: float) -> list:
     """The quaternion that brings the body's z axis from the world's to the tilt from up, towards x, in components."""
-    return composed(_about((0.0, 0.0, 1.0), -tilt), _about((1.0, 0.0, 0.0), -np.pi / 2))
+    return multiply_quaternions(_axis_quaternion((0.0, 0.0, 1.0), -tilt), _axis_quaternion((1.0, 0.0, 0.0), -np.pi / 2))
 
 
-def _axis(flight: Trajectory) -> np.ndarray:
+def _body_axis(flight: Trajectory) -> np.ndarray:
     """Where the body's z axis points, at every frame."""
     q = jnp.asarray(flight.state.orientation)
-    return np.asarray(turn(q, jnp.broadcast_to(jnp.asarray(OWN, q.dtype), (*q.shape[:-1], 3))))
+    return np.asarray(rotate_vector(q, jnp.broadcast_to(jnp.asarray(BODY_AXIS, q.dtype), (*q.shape[:-1], 3))))
 
 
-def _seen(flight: Trajectory) -> np.ndarray:
+def _body_angular_velocity(flight: Trajectory) -> np.ndarray:
     """The angular velocity seen from the body, at every frame [rad/s]."""
     states = jax.tree.map(jnp.asarray, flight.state)
     omega = jax.vmap(lambda state: rigid.angular_velocity(state, flight.scene.mass))(states)
-    return np.asarray(turn_back(states.orientation, omega))
+    return np.asarray(rotate_vector_back(states.orientation, omega))
 
 
-def _rate(plane: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _turn_rate(plane: np.ndarray, time: np.ndarray) -> np.ndarray:
     """How fast the angle of vectors of a plane grows [rad/s], frames along the first axis."""
     angle = np.unwrap(np.arctan2(plane[..., 1], plane[..., 0]), axis=0)
     return (angle[-1] - angle[0]) / time[-1]

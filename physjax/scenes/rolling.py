@@ -20,14 +20,14 @@ def rolling(slope: float = 0.3, radius: float = 0.3, length: float = 0.8, g: flo
 
     A cylinder touches with the ends of its axis, each with the radius around it; the ball has both in its middle.
     """
-    down, up = _along(slope), np.array([np.sin(slope), np.cos(slope), 0.0])
+    down, up = _slope_direction(slope), np.array([np.sin(slope), np.cos(slope), 0.0])
     ball, roller = inertia.sphere(2.0, radius), inertia.cylinder(2.0, radius, length)
     both = inertia.Inertia(2.0, jnp.stack([ball.principal, roller.principal]))
     axis = np.zeros((2, 2, 3))
     axis[1, :, 2] = -length / 2, length / 2
     ground = contacts.Plane((0.0, 0.0, 0.0), up, coulomb=contacts.Coulomb(0.4, 0.4))
     start = rigid.bodies(both, radius * up + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-    race = Scene(start, both, (forces.Gravity(g),), (rigid.Touch(rigid.Hull(axis, radius), ground),))
+    race = Scene(start, both, (forces.Gravity(g),), (rigid.SurfaceContact(rigid.ContactPoints(axis, radius), ground),))
     share = np.array([5 / 7, 2 / 3])
     duration = 1.5
 
@@ -58,7 +58,9 @@ def bowling(speed: float = 6.0, friction: float = 0.12, radius: float = 0.108, g
     ball = inertia.sphere(6.0, radius)
     alley = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(friction, friction))
     start = rigid.bodies(ball, (0.0, radius, 0.0), velocity=(speed, 0.0, 0.0))
-    thrown = Scene(start, ball, (forces.Gravity(g),), (rigid.Touch(rigid.Hull.sphere(radius), alley),))
+    thrown = Scene(
+        start, ball, (forces.Gravity(g),), (rigid.SurfaceContact(rigid.ContactPoints.sphere(radius), alley),)
+    )
     slides = 2 * speed / (7 * friction * g)
     way = speed * slides - friction * g * slides**2 / 2 + 5 / 7 * speed * slides
     return Problem(
@@ -87,14 +89,14 @@ def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
     )
     place = np.array([[-1.0, height, 0.0], [0.0, height, 0.0], [1.0, height, 0.0]])
     start = rigid.bodies(box, place, (0.9, 0.3, 0.2, 0.1), angular_velocity=(1.0, 2.0, 3.0))
-    dropped = Scene(start, box, (forces.Gravity(g),), (rigid.Touch(rigid.Hull.box(size), floor),))
+    dropped = Scene(start, box, (forces.Gravity(g),), (rigid.SurfaceContact(rigid.ContactPoints.box(size), floor),))
 
     def lying(flight):
         """By how much the height of each is off the nearest of the halves of its edges."""
         above = flight.position[-1, :2, 1]
         return np.abs(above[:, None] - size / 2).min(axis=-1)
 
-    def told(flight):
+    def total_energy(flight):
         states, scene = (jax.tree.map(jnp.asarray, part) for part in (flight.state, flight.scene))
         return np.asarray(jax.vmap(lambda t, s: energy.total(scene, t, s))(jnp.asarray(flight.time), states))
 
@@ -105,14 +107,24 @@ def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
         truths=(
             Truth("two come to rest on a face [m]", lying, 0.0, 1e-6),
             Truth("and do not move [m]", lambda f: f.position[-8:, :2] - f.position[-8, :2], 0.0, 1e-9),
-            Truth("the third keeps its energy [relative]", lambda f: told(f)[:, 2] / told(f)[0, 2], 1.0, 1e-6),
-            Truth("no energy is won [relative]", lambda f: np.maximum(told(f) / told(f)[0] - 1, 0.0), 0.0, 1e-6),
+            Truth(
+                "the third keeps its energy [relative]",
+                lambda f: total_energy(f)[:, 2] / total_energy(f)[0, 2],
+                1.0,
+                1e-6,
+            ),
+            Truth(
+                "no energy is won [relative]",
+                lambda f: np.maximum(total_energy(f) / total_energy(f)[0] - 1, 0.0),
+                0.0,
+                1e-6,
+            ),
         ),
         frames=64,
     )
 
 
-def _along(slope: float) -> np.ndarray:
+def _slope_direction(slope: float) -> np.ndarray:
     return np.array([np.cos(slope), -np.sin(slope), 0.0])
 
 

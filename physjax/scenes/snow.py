@@ -12,7 +12,7 @@ from physjax.scene import Scene
 from physjax.scenes.registry import scene
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
-from physjax.vectors import stacked
+from physjax.vectors import stack_components
 
 
 class Hill(contacts.Surface):
@@ -33,18 +33,18 @@ class Hill(contacts.Surface):
         slope = -self.steepness - 2 * u / self.width * bump
         return bump - self.steepness * x, slope, (4 * u * u - 2) / self.width**2 * bump
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes"]:
         """(y - h)/√(1 + h'²) [m]."""
         h, slope, _ = self.height(position[..., 0])
         return (position[..., 1] - h) / jnp.sqrt(1 + slope * slope)
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
         """(-h', 1)/√(1 + h'²)."""
         _, slope, _ = self.height(position[..., 0])
         up = 1 / jnp.sqrt(1 + slope * slope)
-        return stacked([-slope * up, up])
+        return stack_components([-slope * up, up])
 
-    def bend(self, t: ArrayLike, position: Array, relative: Array) -> Array:
+    def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """-h'' v_x²/√(1 + h'²) [m/s²]."""
         _, slope, turn = self.height(position[..., 0])
         return -turn * relative[..., 0] ** 2 / jnp.sqrt(1 + slope * slope)
@@ -62,7 +62,7 @@ def snowboard(steepness: float = 0.4, jump: float = 1.5, g: float = 9.8) -> Prob
     top, slope, _ = hill.height(x)
     along = np.array([1.0, slope[0]]) / np.hypot(1.0, slope[0])
     start = Particles(jnp.stack([x, top], axis=-1), np.outer(speed, along))
-    place, pace, lands = _flights(hill, np.asarray(top) + speed**2 / (2 * g), g)
+    place, pace, lands = _solve_flights(hill, np.asarray(top) + speed**2 / (2 * g), g)
 
     def flown(flight):
         """Seconds since each took off, at every frame, and whether it is in the air."""
@@ -84,13 +84,13 @@ def snowboard(steepness: float = 0.4, jump: float = 1.5, g: float = 9.8) -> Prob
         truths=(
             Truth("takes off as fast as its fall has made it [relative]", slower, 0.0, 1e-6),
             Truth("flies along the parabola from where -h'' v_x² = g [m]", off, 0.0, 1e-5),
-            Truth("lands where that meets the hill [m]", _landing, lands, 2e-4),
+            Truth("lands where that meets the hill [m]", _find_landings, lands, 2e-4),
         ),
         frames=128,
     )
 
 
-def _flights(hill: Hill, energy: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solve_flights(hill: Hill, energy: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where each board takes off, (x, y) [m], its velocity there [m/s], and the x where it lands [m]; E/(mg) is given [m]."""
     x = np.linspace(0.0, 60.0, 600_001)
     h, slope, turn = (np.asarray(part, float) for part in hill.height(jnp.asarray(x)))
@@ -106,7 +106,7 @@ def _flights(hill: Hill, energy: np.ndarray, g: float) -> tuple[np.ndarray, np.n
     return place, pace, lands
 
 
-def _landing(flight: Trajectory) -> np.ndarray:
+def _find_landings(flight: Trajectory) -> np.ndarray:
     """Where each came down: from the last frame before, straight on for the time that is left [m]."""
     since = np.asarray(flight.final_scene.contacts[0].touching_since)
     last, lane = np.searchsorted(flight.time, since) - 1, np.arange(since.size)

@@ -48,11 +48,13 @@ def basketball(angle: float = 0.96, g: float = 9.8) -> Problem:
         shots,
         duration=1.2,
         truths=(
-            Truth("flies to the board as diffrax says [m]", lambda f: _off(f, f.velocity[..., 0] > 0), 0.0, 1e-9),
+            Truth(
+                "flies to the board as diffrax says [m]", lambda f: _path_error(f, f.velocity[..., 0] > 0), 0.0, 1e-9
+            ),
             Truth("meets the board between its edges at 2.90 and 3.95 m [m]", met, 3.425, 0.525),
             Truth(
                 "falls through the ring and clear of it: its centre less than 10.5 cm from the ring's [m]",
-                lambda f: _crossing(f, 1, rim, -1)[..., 0] - ring,
+                lambda f: _find_crossing(f, 1, rim, -1)[..., 0] - ring,
                 0.0,
                 clearance,
             ),
@@ -85,15 +87,15 @@ def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
     )
     bounced = lambda flight: np.diff(flight.velocity[:, 1]) > 0  # noqa: E731
     flown = lambda flight: np.concatenate([[True], ~np.maximum.accumulate(bounced(flight))])  # noqa: E731
-    line = lambda flight: _crossing(flight, 0, goal, +1)  # noqa: E731
+    line = lambda flight: _find_crossing(flight, 0, goal, +1)  # noqa: E731
     return Problem(
         ball,
         duration=1.12,
         truths=(
-            Truth("flies and curves to the ground as diffrax says [m]", lambda f: _off(f, flown(f)), 0.0, 1e-9),
+            Truth("flies and curves to the ground as diffrax says [m]", lambda f: _path_error(f, flown(f)), 0.0, 1e-9),
             Truth(
                 "passes the wall beside its last player, who stands 1 m from the middle [m]",
-                lambda f: np.maximum(edge + radius - _crossing(f, 0, wall, +1)[2], 0.0),
+                lambda f: np.maximum(edge + radius - _find_crossing(f, 0, wall, +1)[2], 0.0),
                 0.0,
                 0.0,
             ),
@@ -105,14 +107,14 @@ def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
     )
 
 
-def _off(flight, before):
+def _path_error(flight, before):
     """Largest distance [m] between a run and diffrax's, which knows no contacts, over the frames before a touch."""
     free = Scene(flight.scene.state, flight.scene.mass, flight.scene.forces)
     path = reference(free, flight.time, rtol=1e-12, atol=1e-12)
     return (np.linalg.norm(flight.position - path.position, axis=-1) * before).max()
 
 
-def _crossing(flight, axis, level, way):
+def _find_crossing(flight, axis, level, way):
     """Where each lane first passes a level of one coordinate, upward (`way` +1) or downward (-1), straight between frames."""
     beyond = way * (flight.position[..., axis] - level)
     first = np.argmax((beyond[:-1] < 0) & (beyond[1:] >= 0), axis=0)[None, ..., None]

@@ -89,7 +89,7 @@ def jelly_cube(nodes: int = 4, side: float = 0.2, lean: float = 0.0, g: float = 
 @scene
 def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) -> Problem:
     """A bridge under a load that grows by four tonnes a second until a beam parts, the next one follows, and it falls."""
-    bridge, start = _standing(breaks_at, g)
+    bridge, start = _build_loaded_bridge(breaks_at, g)
     loaded = np.zeros((start.shape[0], 2))
     loaded[np.flatnonzero(bridge.nodes["deck"])[2], 1] = -rate
     breaking = Scene(
@@ -99,7 +99,7 @@ def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) 
         pinned=bridge.nodes["supports"],
     )
     weight = np.asarray(bridge.mass)[:, None] * np.array([0.0, -g])
-    strain = lambda t: _strain(bridge, _equilibrium(bridge, weight + t * loaded))  # noqa: E731
+    strain = lambda t: _strain(bridge, _solve_equilibrium(bridge, weight + t * loaded))  # noqa: E731
     low, high = 0.0, 10.0
     for _ in range(30):
         t = 0.5 * (low + high)
@@ -112,17 +112,19 @@ def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) 
         truths=(
             Truth(
                 "the first beam parts under the load that statics says [s]",
-                lambda f: f.time[_first_break(f)],
+                lambda f: f.time[_find_first_break(f)],
                 low,
                 0.05,
             ),
             Truth(
                 "it is the one that is stretched most in statics",
-                lambda f: _parted(f)[_first_break(f)][weakest],
+                lambda f: _mark_broken(f)[_find_first_break(f)][weakest],
                 True,
                 0,
             ),
-            Truth("what has parted stays parted", lambda f: np.minimum(np.diff(_parted(f), axis=0), 0.0), 0.0, 0.0),
+            Truth(
+                "what has parted stays parted", lambda f: np.minimum(np.diff(_mark_broken(f), axis=0), 0.0), 0.0, 0.0
+            ),
             Truth("the bridge falls: its lowest node at the end [m]", lambda f: f.position[-1, :, 1].min(), -5.0, 4.0),
         ),
         frames=128,
@@ -132,7 +134,7 @@ def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) 
 @scene
 def blown_bridge(impulse: float = 2e4, breaks_at: float = 0.03, g: float = 9.8) -> Problem:
     """The same bridge, blown up from below: the beams near the blast part, what is left flies or falls."""
-    bridge, start = _standing(breaks_at, g)
+    bridge, start = _build_loaded_bridge(breaks_at, g)
     blast = forces.Blast((0.4 * SPAN, -1.0), impulse, reach=2.0, at=1 / 512, duration=1 / 512)
     blown = Scene(
         Particles(start, jnp.zeros_like(start)),
@@ -148,8 +150,8 @@ def blown_bridge(impulse: float = 2e4, breaks_at: float = 0.03, g: float = 9.8) 
     def received(flight):
         """Momentum gained while the blast lasts, less what springs and weight gave meanwhile (the mean of both ends)."""
         before, after = (Particles(flight.position[i], flight.velocity[i]) for i in (1, 2))
-        others = flight.scene.having(forces=flight.scene.forces[:2])
-        steady = 0.5 * (np.asarray(_load(others, before)) + np.asarray(_load(others, after)))
+        others = flight.scene.replace(forces=flight.scene.forces[:2])
+        steady = 0.5 * (np.asarray(_evaluate_loads(others, before)) + np.asarray(_evaluate_loads(others, after)))
         gained = np.asarray(flight.scene.mass)[:, None] * (after.velocity - before.velocity)
         return (gained - steady * (flight.time[2] - flight.time[1]))[free]
 
@@ -158,15 +160,17 @@ def blown_bridge(impulse: float = 2e4, breaks_at: float = 0.03, g: float = 9.8) 
         duration=1.0,
         truths=(
             Truth("each node gets the impulse J/(1 + (d/r)²) [N s]", received, expected[free], 0.005 * impulse),
-            Truth("nothing parts before the blast", lambda f: _parted(f)[1], 0.0, 0.0),
-            Truth("some of the beams part [share of all]", lambda f: _parted(f)[-1].mean(), 0.5, 0.49),
-            Truth("what has parted stays parted", lambda f: np.minimum(np.diff(_parted(f), axis=0), 0.0), 0.0, 0.0),
+            Truth("nothing parts before the blast", lambda f: _mark_broken(f)[1], 0.0, 0.0),
+            Truth("some of the beams part [share of all]", lambda f: _mark_broken(f)[-1].mean(), 0.5, 0.49),
+            Truth(
+                "what has parted stays parted", lambda f: np.minimum(np.diff(_mark_broken(f), axis=0), 0.0), 0.0, 0.0
+            ),
         ),
         frames=512,
     )
 
 
-_load = jax.jit(lambda scene, state: loads(scene, 0.0, state))
+_evaluate_loads = jax.jit(lambda scene, state: loads(scene, 0.0, state))
 
 
 class _GrowingLoad(Force):
@@ -181,14 +185,14 @@ class _GrowingLoad(Force):
         return t * self.rate
 
 
-def _standing(breaks_at, g):
+def _build_loaded_bridge(breaks_at, g):
     """The bridge, and the positions in which it carries its own weight."""
     bridge = lattices.bridge(SPAN, HEIGHT, PANELS, mass=6000.0, stiffness=2e6, damping=1e4, breaks_at=breaks_at)
     weight = np.asarray(bridge.mass)[:, None] * np.array([0.0, -g])
-    return bridge, jnp.asarray(_equilibrium(bridge, weight))
+    return bridge, jnp.asarray(_solve_equilibrium(bridge, weight))
 
 
-def _equilibrium(bridge, load):
+def _solve_equilibrium(bridge, load):
     """Where the nodes stand under a load [N], in NumPy: Newton's method on the forces of the beams."""
     x, held = np.asarray(bridge.state.position, float).copy(), np.repeat(bridge.nodes["supports"], 2)
     (a, b), rest = bridge.springs.pairs.T, np.asarray(bridge.springs.rest_length, float)
@@ -219,11 +223,11 @@ def _strain(bridge, x):
     return np.linalg.norm(x[b] - x[a], axis=1) / np.asarray(bridge.springs.rest_length) - 1
 
 
-def _parted(flight):
+def _mark_broken(flight):
     """1 for each beam that has parted, else 0, `(frames, beams)`."""
     return 1.0 - np.asarray(flight.parts[0].unbroken)
 
 
-def _first_break(flight):
+def _find_first_break(flight):
     """The first frame in which a beam has parted."""
-    return int(np.argmax(_parted(flight).any(axis=1)))
+    return int(np.argmax(_mark_broken(flight).any(axis=1)))

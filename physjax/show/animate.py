@@ -11,15 +11,15 @@ from typing import Any
 
 from jax.typing import ArrayLike
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.show.films import Film, schedule
-from physjax.show.frames import faces_of, take, take_lanes
-from physjax.show.panels import scenery_of
-from physjax.show.particles import cloud_of
-from physjax.show.solids import taken_bodies
-from physjax.show.spring_lines import colour_bar, lines, strands_of, take_springs
-from physjax.show.surfaces import surface
-from physjax.show.trails import swarm_of, swarm_scenery
+from physjax.show.frames import get_faces, take_frames, take_lanes
+from physjax.show.panels import build_scenery
+from physjax.show.particles import prepare_particles
+from physjax.show.solids import take_bodies
+from physjax.show.spring_lines import build_spring_lines, draw_springs, draw_strain_bar, take_springs
+from physjax.show.surfaces import draw_surface
+from physjax.show.trails import build_trail_scenery, build_trails
 from physjax.show.view import View, view
 from physjax.trajectory import Trajectory
 
@@ -44,10 +44,10 @@ def cloth(
         11
     """
     who = "animate.cloth"
-    faces, nodes = faces_of(who, sheet)
-    seen = take(who, film, scene=scene, nodes=nodes, dims=(3,))
+    faces, nodes = get_faces(who, sheet)
+    seen = take_frames(who, film, scene=scene, nodes=nodes, dims=(3,))
     frames, fps = schedule(who, seen, fps, speed)
-    return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color))
+    return Film(build_scenery(seen, frames), frames, fps, partial(draw_surface, faces=faces, color=color))
 
 
 def bodies(
@@ -67,9 +67,9 @@ def bodies(
         11
     """
     who = "animate.bodies"
-    seen, faces = taken_bodies(who, film, shapes)
+    seen, faces = take_bodies(who, film, shapes)
     frames, fps = schedule(who, seen, fps, speed)
-    return Film(scenery_of(seen, frames), frames, fps, partial(surface, faces=faces, color=color, closed=True))
+    return Film(build_scenery(seen, frames), frames, fps, partial(draw_surface, faces=faces, color=color, closed=True))
 
 
 def springs(
@@ -91,9 +91,9 @@ def springs(
     who = "animate.springs"
     seen, given, index = take_springs(who, film, sheet, scene)
     frames, fps = schedule(who, seen, fps, speed)
-    strands = strands_of(who, film, given, index, seen, frames, limit)
-    bar = partial(colour_bar, strands=strands)
-    return Film(scenery_of(seen, frames), frames, fps, partial(lines, strands=strands), bar=bar)
+    spring_lines = build_spring_lines(who, film, given, index, seen, frames, limit)
+    bar = partial(draw_strain_bar, spring_lines=spring_lines)
+    return Film(build_scenery(seen, frames), frames, fps, partial(draw_springs, spring_lines=spring_lines), bar=bar)
 
 
 def paths(
@@ -116,11 +116,11 @@ def paths(
         'flight.gif'
     """
     who = "animate.paths"
-    every, trail = positive_integer("every", every), float(real_quantity("trail [s]", trail, at_least=0))
+    every, trail = as_positive_integer("every", every), float(as_real_quantity("trail [s]", trail, at_least=0))
     seen = take_lanes(who, film)
     frames, fps = schedule(who, seen, fps, speed)
-    seen, draw = swarm_of(who, seen, every, color, trail * speed)
-    scenery, axes = swarm_scenery(seen, frames)
+    seen, draw = build_trails(who, seen, every, color, trail * speed)
+    scenery, axes = build_trail_scenery(seen, frames)
     return Film(scenery, frames, fps, draw, axes=axes)
 
 
@@ -137,9 +137,9 @@ def particles(
         11
     """
     who = "animate.particles"
-    seen, draw, bar = cloud_of(who, film, density)
+    seen, draw, bar = prepare_particles(who, film, density)
     frames, fps = schedule(who, seen, fps, speed)
-    return Film(scenery_of(seen, frames), frames, fps, draw, bar=bar)
+    return Film(build_scenery(seen, frames), frames, fps, draw, bar=bar)
 
 
 __all__ = ["Film", "View", "bodies", "cloth", "particles", "paths", "springs", "view"]

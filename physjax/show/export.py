@@ -12,22 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from physjax.files import replacing, replacing_folder
-from physjax.show.drawables import Bodies, Dots, Lines, Surface, subject
+from physjax.files import write_atomically, write_folder_atomically
+from physjax.show.drawables import Bodies, Dots, Lines, Surface, choose_drawable
 from physjax.show.films import schedule
-from physjax.show.frames import Take, batch_index, unbroken
+from physjax.show.frames import Frames, find_batch_index, find_intact_springs
 from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document
-from physjax.show.pages import demanded
+from physjax.show.pages import check_output_path
 from physjax.text import progress_bar
 from physjax.trajectory import Trajectory
 
 __all__ = ["gltf", "ply"]
 
-MOST_SHAPES = 240
+MAX_MORPH_TARGETS = 240
 """Frames of what deforms in one glTF file: each is a morph target, and programs slow down or give up beyond a few hundred."""
-MOST_BYTES = 2**30
+MAX_MORPH_BYTES = 2**30
 """Of the arrays in one glTF file; its own limit is four times that."""
-COLOR = "#56B4E9"
+DEFAULT_COLOR = "#56B4E9"
 
 
 def gltf(
@@ -36,7 +36,7 @@ def gltf(
     shown: Any = None,
     *,
     scene: int | Sequence[int] | None = None,
-    color: Any = COLOR,
+    color: Any = DEFAULT_COLOR,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
     progress: bool = True,
@@ -56,25 +56,25 @@ def gltf(
         'tumble.glb'
     """
     who = "export.gltf"
-    path = demanded(path, (".glb",))
-    seen = subject(who, film, shown, scene, dims=(2, 3))
-    frames, fps = schedule(who, seen.take, fps, speed)
-    place = _places(who, seen.take, frames)
+    path = check_output_path(path, (".glb",))
+    seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
+    frames, fps = schedule(who, seen.run, fps, speed)
+    place = _require_finite_positions(who, seen.run, frames)
     if not isinstance(seen, Bodies):
-        _demand_few(who, place)
-    if isinstance(seen, Lines) and _parts(who, film, seen, scene, frames):
+        _check_morph_size(who, place)
+    if isinstance(seen, Lines) and _any_spring_breaks(who, film, seen, scene, frames):
         raise ValueError(
             f"{who}: got springs that part, expected ones that hold: glTF cannot take a line away. export.ply writes "
             "those that hold."
         )
-    document = Document(seen.take.up if seen.take.dim == 3 else 1)
+    document = Document(seen.run.up if seen.run.dim == 3 else 1)
     times = document.accessor(np.arange(len(frames)) / fps)
-    material = document.material(_rgb(color))
+    material = document.material(_to_rgb(color))
     if isinstance(seen, Bodies):
         _add_bodies(document, seen, place, frames, times, material)
     else:
-        _add_morphing(document, seen, _counted(place, progress), times, material)
-    with replacing(path, "wb") as file:
+        _add_morphing(document, seen, _track_progress(place, progress), times, material)
+    with write_atomically(path, "wb") as file:
         file.write(document.bytes())
     return path
 
@@ -102,22 +102,28 @@ def ply(
     """
     who = "export.ply"
     folder = Path(folder)
-    seen = subject(who, film, shown, scene, dims=(2, 3))
+    seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
     seen = seen.surface() if isinstance(seen, Bodies) else seen
-    frames, fps = schedule(who, seen.take, fps, speed)
-    held = unbroken(who, film, seen.springs, batch_index(who, film, scene)) if isinstance(seen, Lines) else None
+    frames, fps = schedule(who, seen.run, fps, speed)
+    held = (
+        find_intact_springs(who, film, seen.springs, find_batch_index(who, film, scene))
+        if isinstance(seen, Lines)
+        else None
+    )
     digits = max(4, len(str(len(frames))))
     names = [f"frame_{number:0{digits}d}.ply" for number in range(len(frames))]
-    with replacing_folder(folder) as inside:
-        for name, frame in _counted(list(zip(names, frames, strict=True)), progress):
-            place = _in_space(seen.take.position[frame])
-            (inside / name).write_bytes(_ply(seen, place, None if held is None else held[frame], seen.take.time[frame]))
+    with write_folder_atomically(folder) as inside:
+        for name, frame in _track_progress(list(zip(names, frames, strict=True)), progress):
+            place = _pad_to_three(seen.run.position[frame])
+            (inside / name).write_bytes(
+                _encode_ply(seen, place, None if held is None else held[frame], seen.run.time[frame])
+            )
     return [folder / name for name in names]
 
 
 def _add_bodies(document: Document, seen: Bodies, place: np.ndarray, frames: list[int], times: int, look: int) -> None:
     """A mesh for each different shape, a node for each body."""
-    turn = np.roll(_continuous(seen.orientation[frames]), -1, axis=-1)
+    turn = np.roll(_align_quaternion_signs(seen.orientation[frames]), -1, axis=-1)
     meshes: dict[bytes, int] = {}
     for body, shape in enumerate(seen.shapes):
         same = shape.vertices.tobytes() + shape.faces.tobytes()
@@ -144,7 +150,7 @@ def _add_morphing(document: Document, seen: Any, places: Iterable[np.ndarray], t
     document.animate(node, "weights", times, document.accessor(weights.ravel()))
 
 
-def _ply(seen: Any, place: np.ndarray, held: np.ndarray | None, time: float) -> bytes:
+def _encode_ply(seen: Any, place: np.ndarray, held: np.ndarray | None, time: float) -> bytes:
     """A frame as a file."""
     vertices = place.astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"comment t = {time:.9g} s"]
@@ -163,52 +169,52 @@ def _ply(seen: Any, place: np.ndarray, held: np.ndarray | None, time: float) -> 
     return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + table.tobytes()
 
 
-def _places(who: str, take: Take, frames: list[int]) -> np.ndarray:
+def _require_finite_positions(who: str, run: Frames, frames: list[int]) -> np.ndarray:
     """Positions at the frames `(frames, nodes, 3)`, all finite; a ValueError otherwise."""
-    place = _in_space(take.position[frames])
-    lost = ~np.isfinite(place).all(axis=(0, 2))
-    if lost.any():
+    place = _pad_to_three(run.position[frames])
+    non_finite = ~np.isfinite(place).all(axis=(0, 2))
+    if non_finite.any():
         raise ValueError(
-            f"{who}: got {lost.sum()} of {lost.size} lanes that blew up, first {int(np.argmax(lost))}; expected finite "
+            f"{who}: got {non_finite.sum()} of {non_finite.size} lanes that blew up, first {int(np.argmax(non_finite))}; expected finite "
             "positions. Leave them out, or write export.ply, which does."
         )
     return place
 
 
-def _in_space(position: np.ndarray) -> np.ndarray:
+def _pad_to_three(position: np.ndarray) -> np.ndarray:
     """Positions with as many zeros as are missing to three components."""
     return np.pad(position.astype(float), [(0, 0)] * (position.ndim - 1) + [(0, 3 - position.shape[-1])])
 
 
-def _demand_few(who: str, place: np.ndarray) -> None:
+def _check_morph_size(who: str, place: np.ndarray) -> None:
     """Raise a ValueError for more frames or bytes than a file of morph targets should have."""
     frames, nodes, _ = place.shape
-    if frames > MOST_SHAPES or 12 * frames * nodes > MOST_BYTES:
+    if frames > MAX_MORPH_TARGETS or 12 * frames * nodes > MAX_MORPH_BYTES:
         raise ValueError(
-            f"{who}: got {frames} frames of {nodes} nodes, {12e-6 * frames * nodes:.3g} MB, expected at most {MOST_SHAPES} "
-            f"frames and {MOST_BYTES / 1e6:.0f} MB of what deforms. Choose a lower fps=, a higher speed=, or export.ply."
+            f"{who}: got {frames} frames of {nodes} nodes, {12e-6 * frames * nodes:.3g} MB, expected at most {MAX_MORPH_TARGETS} "
+            f"frames and {MAX_MORPH_BYTES / 1e6:.0f} MB of what deforms. Choose a lower fps=, a higher speed=, or export.ply."
         )
 
 
-def _parts(who: str, film: Trajectory, seen: Lines, scene: Any, frames: list[int]) -> bool:
-    held = unbroken(who, film, seen.springs, batch_index(who, film, scene))
+def _any_spring_breaks(who: str, film: Trajectory, seen: Lines, scene: Any, frames: list[int]) -> bool:
+    held = find_intact_springs(who, film, seen.springs, find_batch_index(who, film, scene))
     return held is not None and not held[frames].all()
 
 
-def _continuous(q: np.ndarray) -> np.ndarray:
+def _align_quaternion_signs(q: np.ndarray) -> np.ndarray:
     """Quaternions along the first axis, each with the sign that is nearer to the one before it."""
     turned_back = np.sum(q[1:] * q[:-1], axis=-1) < 0
     sign = np.cumprod(np.where(turned_back, -1.0, 1.0), axis=0)
     return np.concatenate([q[:1], q[1:] * sign[..., None]])
 
 
-def _rgb(color: Any) -> tuple[float, float, float]:
+def _to_rgb(color: Any) -> tuple[float, float, float]:
     from matplotlib.colors import to_rgb
 
     return to_rgb(color)
 
 
-def _counted(items: Any, progress: bool) -> Any:
+def _track_progress(items: Any, progress: bool) -> Any:
     return progress_bar(items, progress=progress, desc="writing", unit="frame", leave=False)
 
 

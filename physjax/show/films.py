@@ -10,23 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from physjax.checks import real_quantity
-from physjax.files import replacing
+from physjax.checks import as_real_quantity
+from physjax.files import write_atomically
 from physjax.show import obstacles
-from physjax.show.frames import Take
-from physjax.show.pages import demanded, filled, framed, write_page
-from physjax.show.panels import Scenery, arranged
+from physjax.show.frames import Frames
+from physjax.show.pages import check_output_path, embed_page, fill_page, write_page
+from physjax.show.panels import Scenery, arrange_panels
 from physjax.text import progress_bar
 
-SHADED = 12_000
+LOSSLESS_LIMIT_BYTES = 12_000
 """A picture that takes more bytes than this without loss is compressed with some."""
-LONGEST = 600.0
+MAX_FILM_SECONDS = 600.0
 """A film that plays longer [s] is surely not meant."""
-GREYS, NEARLY_GREY = 32, 8
+GREY_COUNT, GREY_CHANNEL_SPREAD = 32, 8
 """Greys among the 256 colours of a GIF, which are the same for all its frames, so that nothing flickers."""
-TOOLS = 70
+TOOLBAR_PIXELS = 70
 """Room for the buttons below a film in a notebook [pixels]."""
-HUNDREDTH = 0.01
+GIF_TICK_SECONDS = 0.01
 """A GIF counts time in hundredths of a second."""
 
 
@@ -50,7 +50,7 @@ class Film:
         draw: Callable,
         *,
         bar: Callable | None = None,
-        axes: Callable = arranged,
+        axes: Callable = arrange_panels,
         dpi: int = 100,
     ):
         self.scenery, self.frames, self.fps, self.dpi = scenery, tuple(frames), fps, dpi
@@ -63,7 +63,7 @@ class Film:
         """The figure of one picture, counted from 0 or, if negative, from the end."""
         if not -len(self.frames) <= number < len(self.frames):
             raise IndexError(f"still: got picture {number}, expected {-len(self.frames)} to {len(self.frames) - 1}.")
-        figure, show = self._projector()
+        figure, show = self._build_renderer()
         show(self.frames[number])
         return figure
 
@@ -73,10 +73,10 @@ class Film:
         Raises ValueError for another ending and FileNotFoundError where there is no such folder, before anything is
         drawn. Returns the path.
         """
-        path = demanded(path, (".gif", ".html"))
+        path = check_output_path(path, (".gif", ".html"))
         if path.suffix.lower() == ".html":
-            return write_page(path, self._player(progress)[0])
-        with replacing(path, "wb") as file:
+            return write_page(path, self._build_player(progress)[0])
+        with write_atomically(path, "wb") as file:
             self._write_gif(file, progress)
         return path
 
@@ -87,10 +87,10 @@ class Film:
         return file.getvalue()
 
     def _repr_html_(self) -> str:
-        page, height = self._player(progress=True)
-        return framed(page, height + TOOLS)
+        page, height = self._build_player(progress=True)
+        return embed_page(page, height + TOOLBAR_PIXELS)
 
-    def _projector(self) -> tuple[Any, Callable]:
+    def _build_renderer(self) -> tuple[Any, Callable]:
         """A figure, and what shows a frame of the run in it; pyplot knows nothing of it, and does not show it again."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -100,7 +100,7 @@ class Film:
         (ax,) = self._axes(figure, self.scenery, 1, self._bar)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # laid out once: nothing moves but what moves
-        moves = obstacles.moving(self.scenery.contacts)
+        moves = obstacles.has_moving(self.scenery.contacts)
         if not moves:
             self.scenery.obstacles(ax, self.frames[0])
         on_screen: list[Any] = []
@@ -110,67 +110,75 @@ class Film:
                 artist.remove()
             on_screen[:] = self.scenery.obstacles(ax, frame) if moves else []
             on_screen.extend(self._draw(ax, self.scenery, frame))
-            ax.title.set_text(self.scenery.take.title(frame))
+            ax.title.set_text(self.scenery.run.title(frame))
 
         return figure, show
 
     def _write_gif(self, file: Any, progress: bool) -> None:
-        pictures = self._pictures(progress)
+        pictures = self._render_pictures(progress)
         next(pictures).save(
-            file, "GIF", save_all=True, append_images=pictures, duration=self._durations(), loop=0, optimize=False
+            file,
+            "GIF",
+            save_all=True,
+            append_images=pictures,
+            duration=self._compute_durations(),
+            loop=0,
+            optimize=False,
         )
 
-    def _pictures(self, progress: bool) -> Iterator[Any]:
+    def _render_pictures(self, progress: bool) -> Iterator[Any]:
         """The pictures, in the 256 colours that all of them share."""
-        figure, show = self._projector()
-        palette = _palette(
-            [_picture(figure, show, self.frames[int(i)]) for i in np.linspace(0, len(self.frames) - 1, 3)]
+        figure, show = self._build_renderer()
+        palette = _build_palette(
+            [_render_picture(figure, show, self.frames[int(i)]) for i in np.linspace(0, len(self.frames) - 1, 3)]
         )
-        for frame in _counted(self.frames, progress):
-            yield _picture(figure, show, frame).quantize(palette=palette, dither=0)
+        for frame in _track_progress(self.frames, progress):
+            yield _render_picture(figure, show, frame).quantize(palette=palette, dither=0)
 
-    def _durations(self) -> list[int]:
+    def _compute_durations(self) -> list[int]:
         """How long each picture stands [ms]: hundredths of a second that together keep real time."""
-        ends = np.round(np.arange(len(self.frames) + 1) / self.fps / HUNDREDTH)
+        ends = np.round(np.arange(len(self.frames) + 1) / self.fps / GIF_TICK_SECONDS)
         return np.maximum(10 * np.diff(ends), 10).astype(int).tolist()
 
-    def _player(self, progress: bool) -> tuple[str, int]:
+    def _build_player(self, progress: bool) -> tuple[str, int]:
         """A page with all pictures in it, and buttons; and how high a picture is [pixels]."""
-        figure, show = self._projector()
-        middle = _picture(figure, show, self.frames[len(self.frames) // 2])
+        figure, show = self._build_renderer()
+        middle = _render_picture(figure, show, self.frames[len(self.frames) // 2])
         width, height = middle.size
         # lines and points are small and sharp without loss; what is shaded would be large, and shows no loss
-        if len(_webp(middle.quantize(), lossless=True)) <= SHADED:
-            codes = (_webp(picture, lossless=True) for picture in self._pictures(progress))
+        if len(_encode_webp(middle.quantize(), lossless=True)) <= LOSSLESS_LIMIT_BYTES:
+            codes = (_encode_webp(picture, lossless=True) for picture in self._render_pictures(progress))
         else:
-            drawn = (_picture(figure, show, frame) for frame in _counted(self.frames, progress))
-            codes = (_webp(picture, quality=85) for picture in drawn)
+            drawn = (_render_picture(figure, show, frame) for frame in _track_progress(self.frames, progress))
+            codes = (_encode_webp(picture, quality=85) for picture in drawn)
         pictures = ["data:image/webp;base64," + base64.b64encode(code).decode() for code in codes]
-        time = self.scenery.take.time[list(self.frames)]
+        time = self.scenery.run.time[list(self.frames)]
         paced = time[:-1] if len(time) > 2 else time  # the end is shown when it is due, or a little early
         speed = float(f"{np.polyfit(np.arange(len(paced)), paced, 1)[0] * self.fps:.2g}")
-        page = filled("film.html", WIDTH=width, HEIGHT=height, FPS=self.fps, SPEED=speed, PICTURES=json.dumps(pictures))
+        page = fill_page(
+            "film.html", WIDTH=width, HEIGHT=height, FPS=self.fps, SPEED=speed, PICTURES=json.dumps(pictures)
+        )
         return page, height
 
 
-def schedule(who: str, take: Take, fps: int | float, speed: float) -> tuple[list[int], float]:
+def schedule(who: str, run: Frames, fps: int | float, speed: float) -> tuple[list[int], float]:
     """The frames of a run that a film shows, and its pictures a second: `fps`, or as many as the run has frames.
 
     Raises ValueError for a film that would be a single picture or play for longer than ten minutes.
     """
     fps, speed = (
-        float(real_quantity(f"{who}: {n}", v, above=0)) for n, v in (("fps [1/s]", fps), ("speed [1]", speed))
+        float(as_real_quantity(f"{who}: {n}", v, above=0)) for n, v in (("fps [1/s]", fps), ("speed [1]", speed))
     )
-    time = take.time[: take.good]
+    time = run.time[: run.good_frames]
     if len(time) == 1:
         raise ValueError(f"{who}: got a film with one good frame, expected at least two; plot shows a single one.")
     span = (time[-1] - time[0]) / speed
     fps = min(fps, (len(time) - 1) / span)
     count = round(span * fps)
-    if count < 1 or span > LONGEST:
+    if count < 1 or span > MAX_FILM_SECONDS:
         raise ValueError(
             f"{who}: got a run of {time[-1] - time[0]:.3g} s, which at speed={speed:g} plays for {span:.3g} s; expected "
-            f"two pictures to {LONGEST:g} s. With speed={(time[-1] - time[0]) / 10:.2g} it takes ten seconds."
+            f"two pictures to {MAX_FILM_SECONDS:g} s. With speed={(time[-1] - time[0]) / 10:.2g} it takes ten seconds."
         )
     wanted = time[0] + np.arange(count + 1) * speed / fps
     after = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
@@ -179,7 +187,7 @@ def schedule(who: str, take: Take, fps: int | float, speed: float) -> tuple[list
     return nearest.tolist(), fps
 
 
-def _picture(figure: Any, show: Callable, frame: int) -> Any:
+def _render_picture(figure: Any, show: Callable, frame: int) -> Any:
     from PIL import Image
 
     show(frame)
@@ -187,13 +195,13 @@ def _picture(figure: Any, show: Callable, frame: int) -> Any:
     return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
 
 
-def _webp(picture: Any, **options: Any) -> bytes:
+def _encode_webp(picture: Any, **options: Any) -> bytes:
     data = io.BytesIO()
     picture.save(data, "WEBP", **options)
     return data.getvalue()
 
 
-def _palette(pictures: list[Any]) -> Any:
+def _build_palette(pictures: list[Any]) -> Any:
     """A palette of greys, white and black among them, and of the colours that some pictures have in common."""
     from PIL import Image
 
@@ -202,13 +210,13 @@ def _palette(pictures: list[Any]) -> Any:
     for place, picture in enumerate(pictures):
         together.paste(picture, (0, place * height))
     # Pillow takes any colour that is about the nearest: what is almost a grey would take its place
-    found = np.array(together.quantize(256 - GREYS).getpalette()[: 3 * (256 - GREYS)]).reshape(-1, 3)
-    colours = found[np.ptp(found, axis=1) > NEARLY_GREY]
-    greys = np.repeat(np.linspace(0, 255, GREYS).round().astype(int), 3)
+    found = np.array(together.quantize(256 - GREY_COUNT).getpalette()[: 3 * (256 - GREY_COUNT)]).reshape(-1, 3)
+    colours = found[np.ptp(found, axis=1) > GREY_CHANNEL_SPREAD]
+    greys = np.repeat(np.linspace(0, 255, GREY_COUNT).round().astype(int), 3)
     palette = Image.new("P", (1, 1))
     palette.putpalette([*greys.tolist(), *colours.ravel().tolist()])
     return palette
 
 
-def _counted(frames: Sequence[int], progress: bool) -> Iterator[int]:
+def _track_progress(frames: Sequence[int], progress: bool) -> Iterator[int]:
     return iter(progress_bar(frames, progress=progress, desc="drawing", unit="picture", leave=False))

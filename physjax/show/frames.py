@@ -8,10 +8,10 @@ import numpy as np
 from physjax.physics.springs.springs import Springs
 from physjax.trajectory import Trajectory
 
-DAY = 86400.0
+DAY_SECONDS = 86400.0
 
 
-class Take(NamedTuple):
+class Frames(NamedTuple):
     """One scene of a run: `time` (frames,) [s], `position` (frames, nodes, dim) [m], how many frames are `good`, the axis `up`.
 
     A frame is good until a node is no longer finite; where lanes are independent, until none is.
@@ -19,14 +19,14 @@ class Take(NamedTuple):
 
     time: np.ndarray
     position: np.ndarray
-    good: int
+    good_frames: int
     surfaces: tuple
     up: int = 1
 
     @property
     def blew_up(self) -> bool:
         """Whether frames are missing at the end."""
-        return self.good < len(self.time)
+        return self.good_frames < len(self.time)
 
     @property
     def dim(self) -> int:
@@ -36,27 +36,27 @@ class Take(NamedTuple):
     def title(self, frame: int) -> str:
         """The time of a frame, with three figures of the whole duration, and where the run ended if it blew up."""
         span = max(np.ptp(self.time), 1e-12)
-        unit, size = ("d", DAY) if span > 3 * DAY else ("s", 1.0)
+        unit, size = ("d", DAY_SECONDS) if span > 3 * DAY_SECONDS else ("s", 1.0)
         decimals = int(np.clip(2 - np.floor(np.log10(span / size)), 0, 12))
-        end = f"\nblew up after t = {self.time[self.good - 1] / size:.3g} {unit}" if self.blew_up else ""
+        end = f"\nblew up after t = {self.time[self.good_frames - 1] / size:.3g} {unit}" if self.blew_up else ""
         return f"t = {self.time[frame] / size:.{decimals}f} {unit}{end}"
 
 
-def take(
+def take_frames(
     who: str,
     film: Any,
     *,
     scene: int | Sequence[int] | None = None,
     nodes: int | None = None,
     dims: tuple[int, ...] = (2, 3),
-) -> Take:
+) -> Frames:
     """The frames of one scene: of a batch of scenes `(frames, *scenes, nodes, dim)` the one numbered `scene`.
 
     `who` is named in errors. Raises TypeError or ValueError for what is no run, has no positions, is a whole batch,
     has not so many `nodes`, or another dimension than `dims`.
     """
-    time, position = _frames(who, film)
-    for number in batch_index(who, film, scene):
+    time, position = _read_frames(who, film)
+    for number in find_batch_index(who, film, scene):
         position = position[:, number]
     if position.ndim != 3:
         raise ValueError(f"{who}: got positions {position.shape}, expected (frames, nodes, dim): several nodes.")
@@ -66,26 +66,26 @@ def take(
             "Give the lattice the film's scene was made from."
         )
     whole = np.isfinite(position).all(axis=-1).all(axis=-1)
-    return _checked(who, film, time, position, whole, dims)
+    return _build_frames(who, film, time, position, whole, dims)
 
 
-def take_lanes(who: str, film: Any, dims: tuple[int, ...] = (1, 2, 3)) -> Take:
+def take_lanes(who: str, film: Any, dims: tuple[int, ...] = (1, 2, 3)) -> Frames:
     """The frames of a run with all its lanes side by side, `(frames, lanes, dim)`."""
-    time, position = _frames(who, film)
+    time, position = _read_frames(who, film)
     position = position.reshape(len(position), -1, position.shape[-1])
     some = np.isfinite(position).all(axis=-1)
     coupled = film.scene is not None and film.scene.couples and np.ndim(film.ok) == 0
-    return _checked(who, film, time, position, some.all(axis=-1) if coupled else some.any(axis=-1), dims)
+    return _build_frames(who, film, time, position, some.all(axis=-1) if coupled else some.any(axis=-1), dims)
 
 
-def batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | None) -> tuple[int, ...]:
+def find_batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | None) -> tuple[int, ...]:
     """The axes of scenes that come before the nodes, and which one is meant."""
     scenes = film.position.shape[1:-2]
     index = () if scene is None else tuple(np.atleast_1d(scene).tolist())
     if len(index) != len(scenes):
         raise ValueError(
             f"{who}: got positions {film.position.shape} and scene={scene}, expected the number of one scene of "
-            f"{scenes}: {_example(scenes)}."
+            f"{scenes}: {_format_example(scenes)}."
         )
     for number, count in zip(index, scenes, strict=True):
         if not -count <= number < count:
@@ -93,12 +93,12 @@ def batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | None) -
     return index
 
 
-def picked(who: str, take: Take, frames: int | Iterable[int] | None, default: int = 3) -> list[int]:
+def pick_frames(who: str, run: Frames, frames: int | Iterable[int] | None, default: int = 3) -> list[int]:
     """The numbers of the chosen frames, counted from the front; by default so many, evenly over the good ones."""
     if frames is None:
-        return sorted(set(np.linspace(0, take.good - 1, default).round().astype(int).tolist()))
+        return sorted(set(np.linspace(0, run.good_frames - 1, default).round().astype(int).tolist()))
     asked = [frames] if isinstance(frames, int | np.integer) else list(frames)
-    count = len(take.time)
+    count = len(run.time)
     if not asked or any(isinstance(f, bool) or not isinstance(f, int | np.integer) for f in asked):
         raise TypeError(
             f"{who}: got frames={frames!r}, expected whole numbers of frames, e.g. frames=(0, {count - 1})."
@@ -107,17 +107,17 @@ def picked(who: str, take: Take, frames: int | Iterable[int] | None, default: in
         if not -count <= frame < count:
             raise IndexError(
                 f"{who}: got frame {frame}, expected {-count} to {count - 1}: the film has {count} frames, "
-                f"from t = {take.time[0]:g} to {take.time[-1]:g} s."
+                f"from t = {run.time[0]:g} to {run.time[-1]:g} s."
             )
-        if frame % count >= take.good:
+        if frame % count >= run.good_frames:
             raise ValueError(
-                f"{who}: got frame {frame}, t = {take.time[frame]:g} s, where the run has blown up; expected at most "
-                f"{take.good - 1}, the last good one. film.first_bad_step tells when it happened; try a smaller dt."
+                f"{who}: got frame {frame}, t = {run.time[frame]:g} s, where the run has blown up; expected at most "
+                f"{run.good_frames - 1}, the last good one. film.first_bad_step tells when it happened; try a smaller dt."
             )
     return [int(frame) % count for frame in asked]
 
 
-def springs_of(who: str, given: Any) -> Springs:
+def get_springs(who: str, given: Any) -> Springs:
     """The springs of a lattice, or those given themselves; a TypeError for anything else."""
     springs = getattr(given, "springs", given)
     if not isinstance(springs, Springs):
@@ -128,12 +128,12 @@ def springs_of(who: str, given: Any) -> Springs:
     return springs
 
 
-def unbroken(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...]) -> np.ndarray | None:
+def find_intact_springs(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...]) -> np.ndarray | None:
     """Which springs hold at every frame, `(frames, springs)`, as the film remembers; None where none can break."""
     if springs.breaks_at is None:
         return None
     for part in film.parts:
-        if isinstance(part, Springs) and part.network == springs.network:
+        if isinstance(part, Springs) and part.topology == springs.topology:
             held = np.asarray(part.unbroken)
             return held[(slice(None), *index[: held.ndim - 2])]
     raise ValueError(
@@ -142,7 +142,7 @@ def unbroken(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...
     )
 
 
-def faces_of(who: str, sheet: Any) -> tuple[np.ndarray, int | None]:
+def get_faces(who: str, sheet: Any) -> tuple[np.ndarray, int | None]:
     """Triangles `(faces, 3)` of a lattice and its number of nodes; TypeError or ValueError if it has no faces."""
     faces = getattr(sheet, "faces", None)
     if faces is None:
@@ -157,7 +157,7 @@ def faces_of(who: str, sheet: Any) -> tuple[np.ndarray, int | None]:
     return np.asarray(faces), sheet.state.position.shape[-2]
 
 
-def _frames(who: str, film: Any) -> tuple[np.ndarray, np.ndarray]:
+def _read_frames(who: str, film: Any) -> tuple[np.ndarray, np.ndarray]:
     """Times and positions of a run, one time for all lanes."""
     if not isinstance(film, Trajectory):
         raise TypeError(f"{who}: got {type(film).__name__}, expected a film: the Trajectory that simulate returns.")
@@ -179,7 +179,7 @@ def _frames(who: str, film: Any) -> tuple[np.ndarray, np.ndarray]:
     return time, position
 
 
-def _checked(who, film, time, position, whole, dims) -> Take:
+def _build_frames(who, film, time, position, whole, dims) -> Frames:
     dim = position.shape[-1]
     if dim not in dims:
         known = " or ".join(map(str, dims))
@@ -189,16 +189,16 @@ def _checked(who, film, time, position, whole, dims) -> Take:
         )
     if not whole[0]:
         raise ValueError(f"{who}: got a film whose first frame is not finite, expected a start that can be drawn.")
-    good = len(whole) if whole.all() else int(np.argmin(whole))
-    return Take(time, position, good, () if film.scene is None else film.scene.contacts, up_of(film))
+    good_frames = len(whole) if whole.all() else int(np.argmin(whole))
+    return Frames(time, position, good_frames, () if film.scene is None else film.scene.contacts, find_up_axis(film))
 
 
-def up_of(film: Trajectory) -> int:
+def find_up_axis(film: Trajectory) -> int:
     """The axis that is up in a run: its scene's; y where it does not know its scene."""
     return min(1, film.position.shape[-1] - 1) if film.scene is None else film.scene.up
 
 
-def _example(scenes: tuple[int, ...]) -> str:
+def _format_example(scenes: tuple[int, ...]) -> str:
     if not scenes:
         return "there is only one, so leave scene= out"
     return f"scene={0 if len(scenes) == 1 else (0,) * len(scenes)}"

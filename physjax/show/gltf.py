@@ -13,9 +13,9 @@ POINTS, LINES, TRIANGLES = 0, 1, 4
 """What a primitive is made of."""
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
-_UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
+_UPRIGHT_ROTATIONS = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 """The turn by a right angle that brings x, about z, or z, about x, to y."""
-_WIDTHS = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
+_ACCESSOR_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
 
 
 class Document:
@@ -44,9 +44,13 @@ class Document:
         span = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         view = {"buffer": 0, "byteOffset": sum(map(len, self._chunks)), "byteLength": array.nbytes}
         self._chunks.append(array.tobytes())
-        entry = {"componentType": _UINT if whole else _FLOAT, "count": len(array), "type": _WIDTHS[array.shape[1:]]}
-        where = self._add("bufferViews", view if target is None else view | {"target": target})
-        return self._add("accessors", {"bufferView": where} | entry | span)
+        entry = {
+            "componentType": _UINT if whole else _FLOAT,
+            "count": len(array),
+            "type": _ACCESSOR_TYPES[array.shape[1:]],
+        }
+        where = self._append("bufferViews", view if target is None else view | {"target": target})
+        return self._append("accessors", {"bufferView": where} | entry | span)
 
     def vertices(self, array: Any) -> int:
         """Enter what each vertex has."""
@@ -61,15 +65,15 @@ class Document:
         rgb = np.asarray(color, float)
         linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
         look = {"baseColorFactor": [*linear.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
-        return self._add("materials", {"pbrMetallicRoughness": look, "doubleSided": True})
+        return self._append("materials", {"pbrMetallicRoughness": look, "doubleSided": True})
 
     def mesh(self, primitive: dict[str, Any], **more: Any) -> int:
         """A mesh of one primitive."""
-        return self._add("meshes", {"primitives": [primitive]} | more)
+        return self._append("meshes", {"primitives": [primitive]} | more)
 
     def node(self, **what: Any) -> int:
         """A node of the scene."""
-        node = self._add("nodes", what)
+        node = self._append("nodes", what)
         self._json["scenes"][0]["nodes"].append(node)
         return node
 
@@ -83,9 +87,12 @@ class Document:
         """The file: a header, the JSON padded with blanks, and the arrays."""
         binary = b"".join(self._chunks)
         content = self._json | {"buffers": [{"byteLength": len(binary)}]}
-        if self._up in _UPRIGHT and "nodes" in self._json:
-            held, nodes = self._json["scenes"][0]["nodes"], self._json["nodes"]
-            content["nodes"] = [*nodes, {"name": "upright", "children": held, "rotation": _UPRIGHT[self._up]}]
+        if self._up in _UPRIGHT_ROTATIONS and "nodes" in self._json:
+            children, nodes = self._json["scenes"][0]["nodes"], self._json["nodes"]
+            content["nodes"] = [
+                *nodes,
+                {"name": "upright", "children": children, "rotation": _UPRIGHT_ROTATIONS[self._up]},
+            ]
             content["scenes"] = [{"nodes": [len(nodes)]}]
         if self._channels:
             content["animations"] = [{"name": "run", "channels": self._channels, "samplers": self._samplers}]
@@ -101,7 +108,7 @@ class Document:
             + binary
         )
 
-    def _add(self, kind: str, entry: dict[str, Any]) -> int:
+    def _append(self, kind: str, entry: dict[str, Any]) -> int:
         entries = self._json.setdefault(kind, [])
         entries.append(entry)
         return len(entries) - 1

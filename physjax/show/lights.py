@@ -4,15 +4,15 @@ from typing import Any
 
 import numpy as np
 
-CELL = 2.0
+CELL_POINTS = 2.0
 """Width of a cell in which particles are counted [points]."""
-NIGHT = (0.06, 0.06, 0.09)
+NIGHT_COLOUR = (0.06, 0.06, 0.09)
 """What glows is seen against this colour."""
-SIZES = 5
+SIZE_GROUPS = 5
 """Particles that glow are spread over the picture in so many groups of about one size."""
 
 
-def on_paper(ax: Any, position: np.ndarray) -> np.ndarray:
+def project_to_pixels(ax: Any, position: np.ndarray) -> np.ndarray:
     """Where points are in axes that have been laid out [pixels], from the lower left corner of the axes."""
     ax.apply_aspect()
     if position.shape[-1] == 3:
@@ -22,34 +22,34 @@ def on_paper(ax: Any, position: np.ndarray) -> np.ndarray:
     return ax.transData.transform(position) - (ax.bbox.x0, ax.bbox.y0)
 
 
-def shape(ax: Any, cell: float = 1.0) -> tuple[int, int]:
+def count_cells(ax: Any, cell: float = 1.0) -> tuple[int, int]:
     """Rows and columns of the cells [pixels] that cover axes."""
     return int(np.ceil(ax.bbox.height / cell)), int(np.ceil(ax.bbox.width / cell))
 
 
-def night(ax: Any, flat: bool) -> None:
+def darken_background(ax: Any, flat: bool) -> None:
     """Darken the background of axes."""
     if flat:
-        ax.set_facecolor(NIGHT)
+        ax.set_facecolor(NIGHT_COLOUR)
         return
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
-        axis.set_pane_color((*NIGHT, 1.0))
+        axis.set_pane_color((*NIGHT_COLOUR, 1.0))
         axis._axinfo["grid"].update(color="0.3", linewidth=0.5)
 
 
-def glow(paper: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def render_glow(points: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """The sum of the lights of particles, each a bell curve as wide as the particle [pixels], as colours and opacity.
 
     `light` is `(particles, 3)`, red, green and blue at the middle of a particle; what is brighter than 1 is seen as 1.
     """
     total = np.zeros((*shape, 3))
     spread = np.maximum(wide / 4, 0.6)  # two standard deviations are its radius
-    for group in np.array_split(np.argsort(spread), min(SIZES, max(len(spread), 1))):
+    for group in np.array_split(np.argsort(spread), min(SIZE_GROUPS, max(len(spread), 1))):
         if not len(group):
             continue
         sigma = float(np.sqrt(np.mean(spread[group] ** 2)))
         for i in range(3):
-            total[..., i] += _blurred(counted(paper[group], shape, 1.0, light[group, i]), sigma) * (
+            total[..., i] += _blur(count_points(points[group], shape, 1.0, light[group, i]), sigma) * (
                 2 * np.pi * sigma**2
             )
     # black where there is light enough to hide the background, as the sum is over a dark one
@@ -58,13 +58,13 @@ def glow(paper: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: tuple[in
     return np.concatenate([colour, cover[..., None]], axis=-1)
 
 
-def counted(paper: np.ndarray, shape: tuple[int, int], cell: float, weights: Any = None) -> np.ndarray:
+def count_points(points: np.ndarray, shape: tuple[int, int], cell: float, weights: Any = None) -> np.ndarray:
     """How many points are in each cell of a picture of `shape` (rows from below, columns), or the sum of their weights."""
     edges = [np.arange(n + 1) * cell for n in shape]
-    return np.histogram2d(paper[:, 1], paper[:, 0], bins=edges, weights=weights)[0]
+    return np.histogram2d(points[:, 1], points[:, 0], bins=edges, weights=weights)[0]
 
 
-def _blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
+def _blur(picture: np.ndarray, sigma: float) -> np.ndarray:
     """The picture under a bell curve of area 1, by its Fourier transform, with a margin against what comes round."""
     margin = int(np.ceil(4 * sigma))
     padded = np.pad(picture, margin)
@@ -74,7 +74,7 @@ def _blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
     return np.maximum(blurred[margin : margin + picture.shape[0], margin : margin + picture.shape[1]], 0.0)
 
 
-def picture(ax: Any, pixels: np.ndarray, **options: Any) -> Any:
+def draw_image(ax: Any, pixels: np.ndarray, **options: Any) -> Any:
     """Lay an image over all of some axes, its first row below; returns the artist."""
     from matplotlib.image import BboxImage
 

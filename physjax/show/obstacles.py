@@ -15,15 +15,15 @@ import numpy as np
 
 from physjax.parts import Contact
 from physjax.physics.contacts.shapes import Plane, Room, Slab, Sphere
-from physjax.physics.rigid.contact_points import Touch
+from physjax.physics.rigid.contact_points import SurfaceContact
 from physjax.show.stage import Stage
 
 GREY, STONE = "#9AA3AD", "#C9CDD2"
-LIGHT = np.array([0.3, 0.7, 0.65]) / np.sqrt(0.3**2 + 0.7**2 + 0.65**2)
+LIGHT_DIRECTION = np.array([0.3, 0.7, 0.65]) / np.sqrt(0.3**2 + 0.7**2 + 0.65**2)
 """Towards the lamp where y is up: from above, over the right shoulder of who looks."""
-NEAR = 0.3
+NEAR_FLOOR_SHARE = 0.3
 """A floor is worth showing when it is no farther from what moves than this share of the picture."""
-BALL = 0.985
+DRAWN_BALL_SHARE = 0.985
 """A ball is drawn a little smaller, or flat faces of the cloth on it would cut into it."""
 
 
@@ -36,44 +36,44 @@ class Ball(NamedTuple):
     radius: float
 
 
-def shown(contacts: tuple) -> tuple[Contact, ...]:
+def select_shared_surfaces(contacts: tuple) -> tuple[Contact, ...]:
     """The surfaces that are the same for all lanes; of what bodies touch with a hull, the surface."""
-    surfaces = (contact.surface if isinstance(contact, Touch) else contact for contact in contacts)
+    surfaces = (contact.surface if isinstance(contact, SurfaceContact) else contact for contact in contacts)
     return tuple(surface for surface in surfaces if _is_shared(surface))
 
 
-def with_obstacles(stage: Stage, contacts: tuple, times: Sequence[float] = (0.0,)) -> Stage:
+def include_obstacles(stage: Stage, contacts: tuple, times: Sequence[float] = (0.0,)) -> Stage:
     """The box with balls and rooms inside, at those times, and with floors that are near; far larger ones do not count."""
     low, high = stage
     for contact, t in product(contacts, times):
-        for corner in _corners(contact, stage, t):
+        for corner in _find_corners(contact, stage, t):
             if np.abs(corner - (low + high) / 2).max() <= 2.5 * max(stage.size, 1e-12):
-                stage = stage.around(corner, corner)
+                stage = stage.include(corner, corner)
     return stage
 
 
-def flat(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
+def draw_flat(ax: Any, stage: Stage, contacts: tuple, t: float) -> list[Any]:
     """The wrong side of each contact in the plane, shaded, and its edge."""
     count = 241
     x, y = (np.linspace(low, high, count) for low, high in zip(*stage, strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1)
     drawn = []
     for contact in contacts:
-        gap = np.asarray(contact.gap(t, jnp.asarray(points)), float)
-        if gap.min() < 0:
-            drawn.append(ax.contourf(x, y, gap, levels=[-np.inf, 0], colors=[GREY], alpha=0.25, zorder=0))
-        if gap.min() < 0 < gap.max():
-            drawn.append(ax.contour(x, y, gap, levels=[0], colors=[GREY], linewidths=1, zorder=0))
+        signed_distance = np.asarray(contact.signed_distance(t, jnp.asarray(points)), float)
+        if signed_distance.min() < 0:
+            drawn.append(ax.contourf(x, y, signed_distance, levels=[-np.inf, 0], colors=[GREY], alpha=0.25, zorder=0))
+        if signed_distance.min() < 0 < signed_distance.max():
+            drawn.append(ax.contour(x, y, signed_distance, levels=[0], colors=[GREY], linewidths=1, zorder=0))
     return drawn
 
 
-def in_space(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> list[Any]:
-    """Planes, slabs, rooms and bowls as sheets of glass behind everything; balls are drawn by `solid`."""
+def draw_in_space(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> list[Any]:
+    """Planes, slabs, rooms and bowls as sheets of glass behind everything; balls are drawn by `draw_balls`."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     drawn = []
     for contact in contacts:
-        sheets = [polygon for polygon in sheets_of(contact, stage, t) if len(polygon) > 2]
+        sheets = [polygon for polygon in build_sheets(contact, stage, t) if len(polygon) > 2]
         if sheets:
             glass = 0.16 / math.sqrt(len(sheets))  # as many as stand behind each other
             drawn.append(
@@ -82,38 +82,38 @@ def in_space(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> l
             ax.add_collection3d(drawn[-1])
     for contact in contacts:
         if isinstance(contact, Sphere) and contact.inside:
-            bowl = _within(stage, _sphere(contact, t))
+            bowl = _crop_ball(stage, _build_ball(contact, t))
             far = (bowl.corners.mean(axis=1) - _center(contact, t))[:, up] < 0
             drawn.append(Poly3DCollection(bowl.corners[far], facecolors=GREY, linewidths=0, alpha=0.12, zorder=0))
             ax.add_collection3d(drawn[-1])
     return drawn
 
 
-def balls(stage: Stage, contacts: tuple, t: float) -> list[Ball]:
+def find_balls(stage: Stage, contacts: tuple, t: float) -> list[Ball]:
     """The balls in the way at a time, as flat patches, as far as they are in the picture."""
-    spheres = [_sphere(c, t, BALL) for c in contacts if isinstance(c, Sphere) and not c.inside]
-    return [_within(stage, ball) for ball in spheres]
+    spheres = [_build_ball(c, t, DRAWN_BALL_SHARE) for c in contacts if isinstance(c, Sphere) and not c.inside]
+    return [_crop_ball(stage, ball) for ball in spheres]
 
 
-def solid(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> list[Any]:
+def draw_balls(ax: Any, stage: Stage, contacts: tuple, t: float, up: int = 1) -> list[Any]:
     """Draw the balls in the way, behind what moves."""
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     drawn = []
-    for ball in balls(stage, contacts, t):
-        lit = shades(ball, up)
+    for ball in find_balls(stage, contacts, t):
+        lit = shade_ball(ball, up)
         drawn.append(Poly3DCollection(ball.corners, facecolors=lit, edgecolors=lit, linewidths=0.3, zorder=1))
         ax.add_collection3d(drawn[-1])
     return drawn
 
 
-def hidden(balls: list[Ball], points: np.ndarray, ax: Any, up: int = 1) -> np.ndarray:
+def find_hidden(balls: list[Ball], points: np.ndarray, ax: Any, up: int = 1) -> np.ndarray:
     """Which points `(points, 3)` stand behind one of the balls, as the axes are turned when they are drawn.
 
     Sorting polygons by depth, as matplotlib does, lets a ball show through the cloth that lies on it.
     """
     rise, turn = np.radians([ax.elev, ax.azim])
-    eye = upright(np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)]), up)
+    eye = orient_up(np.array([np.cos(rise) * np.sin(turn), np.sin(rise), np.cos(rise) * np.cos(turn)]), up)
     behind = np.zeros(len(points), bool)
     for ball in balls:
         away = points - ball.center
@@ -122,19 +122,19 @@ def hidden(balls: list[Ball], points: np.ndarray, ax: Any, up: int = 1) -> np.nd
     return behind
 
 
-def upright(vector: np.ndarray, up: int) -> np.ndarray:
+def orient_up(vector: np.ndarray, up: int) -> np.ndarray:
     """A vector of a space in which y is up as one of a space in which another axis is: the three in the same cycle."""
     return np.roll(vector, up - 1)
 
 
-def shades(ball: Ball, up: int = 1) -> np.ndarray:
+def shade_ball(ball: Ball, up: int = 1) -> np.ndarray:
     """Colours of a ball's patches, lighter towards the lamp."""
     from matplotlib.colors import to_rgb
 
-    return (0.72 + 0.28 * np.maximum(ball.normals @ upright(LIGHT, up), 0))[:, None] * to_rgb(STONE)
+    return (0.72 + 0.28 * np.maximum(ball.normals @ orient_up(LIGHT_DIRECTION, up), 0))[:, None] * to_rgb(STONE)
 
 
-def moving(contacts: tuple) -> bool:
+def has_moving(contacts: tuple) -> bool:
     """Whether any of them has to be drawn anew for every frame; what does not say that it moves stands still."""
     return any(getattr(contact, "velocity", None) is not None for contact in contacts)
 
@@ -147,7 +147,7 @@ def _is_shared(contact: Contact) -> bool:
     )
 
 
-def _corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
+def _find_corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
     """Points that belong into the picture."""
     if isinstance(contact, Sphere):
         center, radius = _center(contact, t), float(contact.radius)
@@ -159,30 +159,30 @@ def _corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
     normal, corners = _unit(contact.normal), np.array(list(product(*zip(*stage, strict=True))))
     gaps = (corners - _center(contact, t)) @ normal
     nearest = np.abs(gaps).argmin()
-    near = gaps.min() > 0 and gaps[nearest] <= NEAR * stage.size
+    near = gaps.min() > 0 and gaps[nearest] <= NEAR_FLOOR_SHARE * stage.size
     return [corners[nearest] - gaps[nearest] * normal] if near else []
 
 
-def sheets_of(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
+def build_sheets(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
     """The flat surfaces of a contact at a time as polygons `(corners, 3)` [m], where they cut the box; none of a ball."""
     if isinstance(contact, Plane):
-        return [_cut(stage, _center(contact, t), _unit(contact.normal))]
+        return [_cut_box(stage, _center(contact, t), _unit(contact.normal))]
     if isinstance(contact, Slab):
         normal, half = _unit(contact.normal), float(contact.thickness) / 2
-        return [_cut(stage, _center(contact, t) + side * half * normal, normal) for side in (-1, 1)]
+        return [_cut_box(stage, _center(contact, t) + side * half * normal, normal) for side in (-1, 1)]
     if isinstance(contact, Room):
-        return _walls(contact, t)
-    return _extruded(contact.profile, stage) if hasattr(contact, "profile") else []
+        return _build_walls(contact, t)
+    return _extrude_profile(contact.profile, stage) if hasattr(contact, "profile") else []
 
 
-def _extruded(profile: Callable, stage: Stage) -> list[np.ndarray]:
+def _extrude_profile(profile: Callable, stage: Stage) -> list[np.ndarray]:
     """The strips between the points of a line in the plane of x and y, from side to side of the box."""
     line = np.asarray(profile(stage.low[0], stage.high[0]), float)
     near, far = (np.column_stack([line, np.full(len(line), side)]) for side in (stage.low[2], stage.high[2]))
     return list(np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=1))
 
 
-def _walls(room: Room, t: float) -> list[np.ndarray]:
+def _build_walls(room: Room, t: float) -> list[np.ndarray]:
     """The six faces of a room."""
     ends = np.stack([room.lower, room.upper]).astype(float) + _shift(room, t)
     faces = []
@@ -194,7 +194,7 @@ def _walls(room: Room, t: float) -> list[np.ndarray]:
     return faces
 
 
-def _cut(stage: Stage, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _cut_box(stage: Stage, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """The polygon in which a plane cuts the box: where it meets the edges, in order around their middle."""
     ends = np.array(list(product(*zip(*stage, strict=True))))
     ends = [(a, b) for i, a in enumerate(ends) for b in ends[i + 1 :] if (a != b).sum() == 1]
@@ -211,7 +211,7 @@ def _cut(stage: Stage, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return found[np.argsort(angle)]
 
 
-def _sphere(sphere: Sphere, t: float, shrunk: float = 1.0, rings: int = 24) -> Ball:
+def _build_ball(sphere: Sphere, t: float, shrunk: float = 1.0, rings: int = 24) -> Ball:
     polar, around = np.linspace(0, np.pi, rings + 1), np.linspace(0, 2 * np.pi, 2 * rings + 1)
     p, a = np.meshgrid(polar, around, indexing="ij")
     points = np.stack([np.sin(p) * np.cos(a), np.cos(p), np.sin(p) * np.sin(a)], axis=-1)
@@ -222,8 +222,8 @@ def _sphere(sphere: Sphere, t: float, shrunk: float = 1.0, rings: int = 24) -> B
     return Ball(center + radius * quads, normals, center, radius)
 
 
-def _within(stage: Stage, ball: Ball) -> Ball:
-    inside = stage.holds(ball.corners).all(axis=1)
+def _crop_ball(stage: Stage, ball: Ball) -> Ball:
+    inside = stage.contains(ball.corners).all(axis=1)
     return ball._replace(corners=ball.corners[inside], normals=ball.normals[inside])
 
 

@@ -7,30 +7,30 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from physjax.files import replacing
+from physjax.files import write_atomically
 
 
 @cache
-def shipped(name: str) -> str:
+def read_web_file(name: str) -> str:
     """A text file of the folder web/."""
     return (resources.files("physjax.show") / "web" / name).read_text(encoding="utf-8")
 
 
-def filled(name: str, **parts: Any) -> str:
+def fill_page(name: str, **parts: Any) -> str:
     """A page of web/ with its buttons, and each `__PART__` in its place."""
-    page = shipped(name).replace("__TOOLS__", shipped("tools.html"))
+    page = read_web_file(name).replace("__TOOLS__", read_web_file("tools.html"))
     for part, content in parts.items():
         page = page.replace(f"__{part}__", str(content))
     return page
 
 
-def framed(page: str, height: int) -> str:
+def embed_page(page: str, height: int) -> str:
     """A page inside a notebook, so many pixels high."""
     style = f"width:100%;height:{height}px;border:0"
     return f'<iframe srcdoc="{html.escape(page)}" style="{style}" allowfullscreen></iframe>'
 
 
-def demanded(path: str | os.PathLike, endings: Any) -> Path:
+def check_output_path(path: str | os.PathLike, endings: Any) -> Path:
     """The path, if its name has one of the endings and its folder is there; ValueError or FileNotFoundError otherwise."""
     path = Path(path)
     if path.suffix.lower() not in endings:
@@ -42,6 +42,6 @@ def demanded(path: str | os.PathLike, endings: Any) -> Path:
 
 def write_page(path: Path, page: str) -> Path:
     """Write a page whole or not at all; returns its path."""
-    with replacing(path) as file:
+    with write_atomically(path) as file:
         file.write(page)
     return path

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.show import solids
-from physjax.show.frames import up_of
+from physjax.show.frames import find_up_axis
 from physjax.show.particles import particles
 from physjax.show.solids import bodies
 from physjax.show.spring_lines import springs
@@ -31,7 +31,7 @@ __all__ = [
     "work_precision",
 ]
 
-MOST_LANES = 200
+MAX_DRAWN_LANES = 200
 """Paths drawn of a scene with more lanes than this; the eye tells no more apart."""
 
 
@@ -46,7 +46,7 @@ def paths(flight: Trajectory, *, every: int = 1, color: ArrayLike | None = None,
         ('x [m]', 'y [m]')
     """
     position = np.asarray(flight.position)
-    position, up = position.reshape(position.shape[0], -1, position.shape[-1]), up_of(flight)
+    position, up = position.reshape(position.shape[0], -1, position.shape[-1]), find_up_axis(flight)
     return draw_paths(np.asarray(flight.time), position, every, color, ax, up)
 
 

@@ -6,15 +6,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from physjax.checks import real_quantity
-from physjax.meshes import checked_mesh
+from physjax.checks import as_real_quantity
+from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia import Inertia
-from physjax.show.frames import Take, picked, take_lanes
-from physjax.show.panels import panels, scenery_of
-from physjax.show.surfaces import surface
+from physjax.show.frames import Frames, pick_frames, take_lanes
+from physjax.show.panels import build_scenery, draw_panels
+from physjax.show.surfaces import draw_surface
 from physjax.trajectory import Trajectory
 
-ROUND = 24
+CIRCLE_CORNERS = 24
 """Corners of what is drawn for a circle."""
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _CUBE_FACES = np.array(
@@ -44,21 +44,21 @@ class Shape(NamedTuple):
 
 def box(size: Any) -> Shape:
     """A box with edges along the axes [m], `(3,)`."""
-    return Shape(_CUBE * np.asarray(real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
+    return Shape(_CUBE * np.asarray(as_real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
 
 
 def cylinder(radius: float, length: float, *, axis: int = 2) -> Shape:
     """A cylinder along an axis of the body (2: z), radius and length [m]."""
-    return _turned_outline(
+    return _revolve_outline(
         [(0.0, -0.5 * length), (radius, -0.5 * length), (radius, 0.5 * length), (0.0, 0.5 * length)], axis
     )
 
 
 def capsule(radius: float, length: float, *, axis: int = 2) -> Shape:
     """A cylinder of a `length` between two hemispheres [m]."""
-    angle = np.linspace(0, np.pi / 2, ROUND // 4 + 1)
+    angle = np.linspace(0, np.pi / 2, CIRCLE_CORNERS // 4 + 1)
     cap = np.stack([radius * np.sin(angle), 0.5 * length + radius * np.cos(angle)], axis=1)
-    return _turned_outline([*(cap * [1, -1]), *cap[::-1]], axis)
+    return _revolve_outline([*(cap * [1, -1]), *cap[::-1]], axis)
 
 
 def sphere(radius: float) -> Shape:
@@ -86,17 +86,19 @@ def bodies(
         2
     """
     who = "plot.bodies"
-    seen, faces = taken_bodies(who, film, shapes)
-    chosen = picked(who, seen, frames)
-    return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color, closed=True), figure)
+    seen, faces = take_bodies(who, film, shapes)
+    chosen = pick_frames(who, seen, frames)
+    return draw_panels(
+        build_scenery(seen, chosen), chosen, partial(draw_surface, faces=faces, color=color, closed=True), figure
+    )
 
 
-def taken_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray]:
+def take_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Frames, np.ndarray]:
     """The frames of a run with the vertices of all shapes in place of the bodies, and the triangles between them."""
-    return in_place(*shapes_of(who, film, shapes))
+    return place_shapes(*check_shapes(who, film, shapes))
 
 
-def shapes_of(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray, list[Shape]]:
+def check_shapes(who: str, film: Trajectory, shapes: Any) -> tuple[Frames, np.ndarray, list[Shape]]:
     """Centres of mass of a run's bodies, their quaternions `(frames, bodies, 4)`, and a checked shape for each."""
     seen = take_lanes(who, film, dims=(3,))
     if not hasattr(film.state, "orientation"):
@@ -107,21 +109,21 @@ def shapes_of(who: str, film: Trajectory, shapes: Any) -> tuple[Take, np.ndarray
     shapes = [shapes] * lanes if isinstance(shapes, Shape) else list(shapes)
     if len(shapes) != lanes or not all(isinstance(shape, Shape) for shape in shapes):
         raise ValueError(f"{who}: got {len(shapes)} shapes, expected a Shape for all {lanes} bodies or one for each.")
-    shapes = [Shape(*checked_mesh(*shape, name=f"{who}: shape {i}")) for i, shape in enumerate(shapes)]
+    shapes = [Shape(*check_mesh(*shape, name=f"{who}: shape {i}")) for i, shape in enumerate(shapes)]
     return seen, np.asarray(film.state.orientation, float).reshape(len(seen.time), lanes, 4), shapes
 
 
-def in_place(seen: Take, orientation: np.ndarray, shapes: list[Shape]) -> tuple[Take, np.ndarray]:
+def place_shapes(seen: Frames, orientation: np.ndarray, shapes: list[Shape]) -> tuple[Frames, np.ndarray]:
     """The shapes of bodies where they are: frames with all their vertices, and the triangles between them."""
     corners = [
-        seen.position[:, i, None] + _turned(orientation[:, i, None], shape.vertices[None])
+        seen.position[:, i, None] + _rotate(orientation[:, i, None], shape.vertices[None])
         for i, shape in enumerate(shapes)
     ]
     whole = shapes[0].joined(*shapes[1:])
     return seen._replace(position=np.concatenate(corners, axis=1)), whole.faces
 
 
-def solid_of(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
+def build_inertia_box(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
     """The box of one density that has a body's mass and moments: edges a² = 6 (I₂ + I₃ - I₁)/m, and so on.
 
     A body with a pivot has the moments about its centre of mass, I - m (|r|² 1 - r rᵀ), and an edge without a moment
@@ -140,19 +142,19 @@ def solid_of(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
     return solid._replace(vertices=solid.vertices @ axes.T)
 
 
-def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     twice = 2 * np.cross(q[..., 1:], v)
     return v + q[..., :1] * twice + np.cross(q[..., 1:], twice)
 
 
-def _turned_outline(outline: Any, axis: int) -> Shape:
+def _revolve_outline(outline: Any, axis: int) -> Shape:
     """The body that an outline (distance from the axis, place on it) leaves when it goes round the axis."""
-    angle = np.linspace(0, 2 * np.pi, ROUND, endpoint=False)
-    rings = [np.stack([r * np.cos(angle), r * np.sin(angle), np.full(ROUND, z)], axis=1) for r, z in outline]
-    here, there = np.arange(ROUND), np.roll(np.arange(ROUND), -1)
+    angle = np.linspace(0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
+    rings = [np.stack([r * np.cos(angle), r * np.sin(angle), np.full(CIRCLE_CORNERS, z)], axis=1) for r, z in outline]
+    here, there = np.arange(CIRCLE_CORNERS), np.roll(np.arange(CIRCLE_CORNERS), -1)
     faces = []
-    for start in range(0, ROUND * (len(outline) - 1), ROUND):
-        low, high = start, start + ROUND
+    for start in range(0, CIRCLE_CORNERS * (len(outline) - 1), CIRCLE_CORNERS):
+        low, high = start, start + CIRCLE_CORNERS
         faces += [
             np.stack([low + here, low + there, high + there], 1),
             np.stack([low + here, high + there, high + here], 1),

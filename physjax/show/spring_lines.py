@@ -8,18 +8,18 @@ import numpy as np
 
 from physjax.physics.springs.springs import Springs
 from physjax.show import obstacles
-from physjax.show.frames import Take, batch_index, picked, springs_of, take, unbroken
-from physjax.show.panels import Scenery, bar_below, panels, scenery_of
+from physjax.show.frames import Frames, find_batch_index, find_intact_springs, get_springs, pick_frames, take_frames
+from physjax.show.panels import Scenery, build_scenery, draw_colour_bar, draw_panels
 from physjax.trajectory import Trajectory
 
-MOST = 99.0
+STRAIN_PERCENTILE = 99.0
 """The colours reach to this percentile of the strains; arrows on the colour bar say that some go beyond."""
 
-TWICE = 1.0
+MAX_BLOWN_UP_STRAIN = 1.0
 """The colours of a run that blew up reach no farther: a spring of twice its length."""
 
 
-class Strands(NamedTuple):
+class SpringLines(NamedTuple):
     """How springs are drawn: pairs, rest lengths [m], which hold at each frame (None: all), and the colours' scale."""
 
     pairs: np.ndarray
@@ -64,74 +64,78 @@ def springs(
     """
     who = "plot.springs"
     seen, given, index = take_springs(who, film, sheet, scene)
-    chosen = picked(who, seen, frames)
-    strands = strands_of(who, film, given, index, seen, chosen, limit)
-    bar = partial(colour_bar, strands=strands)
-    return panels(scenery_of(seen, chosen), chosen, partial(lines, strands=strands), figure, bar)
+    chosen = pick_frames(who, seen, frames)
+    spring_lines = build_spring_lines(who, film, given, index, seen, chosen, limit)
+    bar = partial(draw_strain_bar, spring_lines=spring_lines)
+    return draw_panels(
+        build_scenery(seen, chosen), chosen, partial(draw_springs, spring_lines=spring_lines), figure, bar
+    )
 
 
-def take_springs(who: str, film: Any, sheet: Any, scene: Any) -> tuple[Take, Springs, tuple[int, ...]]:
+def take_springs(who: str, film: Any, sheet: Any, scene: Any) -> tuple[Frames, Springs, tuple[int, ...]]:
     """The film of one scene, the springs in it, and the place of that scene in a batch."""
-    given = springs_of(who, sheet)
-    seen = take(who, film, scene=scene, nodes=given.nodes)
-    return seen, given, batch_index(who, film, scene)
+    given = get_springs(who, sheet)
+    seen = take_frames(who, film, scene=scene, nodes=given.nodes)
+    return seen, given, find_batch_index(who, film, scene)
 
 
-def strands_of(
-    who: str, film: Trajectory, given: Springs, index: tuple, seen: Take, frames: Any, limit: int | float | None
-) -> Strands:
+def build_spring_lines(
+    who: str, film: Trajectory, given: Springs, index: tuple, seen: Frames, frames: Any, limit: int | float | None
+) -> SpringLines:
     """What is known of the springs at all frames; the colours' scale fits the given frames."""
-    held = unbroken(who, film, given, index)
-    rest = np.broadcast_to(_of_scene(np.asarray(given.rest_length, float), index), len(given.pairs))
-    strands = Strands(given.pairs, rest, held, 1.0)
+    held = find_intact_springs(who, film, given, index)
+    rest = np.broadcast_to(_select_scene(np.asarray(given.rest_length, float), index), len(given.pairs))
+    spring_lines = SpringLines(given.pairs, rest, held, 1.0)
     if limit is None:
-        most = [_most(strands, seen.position[frame].astype(float), frame) for frame in frames]
-        limit = min(max(most), TWICE if seen.blew_up else np.inf)
+        most = [_strain_percentile(spring_lines, seen.position[frame].astype(float), frame) for frame in frames]
+        limit = min(max(most), MAX_BLOWN_UP_STRAIN if seen.blew_up else np.inf)
     elif not limit > 0:
         raise ValueError(f"{who}: got limit={limit}, expected a strain > 0, e.g. 0.05 for five per cent.")
-    return strands._replace(limit=float(limit) or 0.01)
+    return spring_lines._replace(limit=float(limit) or 0.01)
 
 
-def _of_scene(numbers: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
+def _select_scene(numbers: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
     """The numbers of one scene, out of those for all springs or one each behind as many axes of scenes as it takes."""
     axes = max(numbers.ndim - 1, 0)
     return numbers[tuple(i if n > 1 else 0 for i, n in zip(index[len(index) - axes :], numbers.shape, strict=False))]
 
 
-def _most(strands: Strands, position: np.ndarray, frame: int) -> float:
+def _strain_percentile(spring_lines: SpringLines, position: np.ndarray, frame: int) -> float:
     """The strain that nearly all springs keep below in a frame, in either direction."""
-    strain = np.abs(strands.strain(position))
-    shown = np.isfinite(strain) & (True if strands.held is None else strands.held[frame])
-    return float(np.percentile(strain[shown], MOST)) if shown.any() else 0.0
+    strain = np.abs(spring_lines.strain(position))
+    shown = np.isfinite(strain) & (True if spring_lines.held is None else spring_lines.held[frame])
+    return float(np.percentile(strain[shown], STRAIN_PERCENTILE)) if shown.any() else 0.0
 
 
-def lines(ax: Any, scenery: Scenery, frame: int, *, strands: Strands) -> list[Any]:
+def draw_springs(ax: Any, scenery: Scenery, frame: int, *, spring_lines: SpringLines) -> list[Any]:
     """Draw a frame: one collection of the springs that hold, and one, dashed and grey, of those that do not."""
     position = scenery.position(frame)
-    ends = position[strands.pairs]
-    seen = scenery.stage.holds(position)[strands.pairs].all(axis=1)
-    held = seen if strands.held is None else seen & strands.held[frame]
-    colours = strands.colours().to_rgba(100 * strands.strain(position)[held])
+    ends = position[spring_lines.pairs]
+    seen = scenery.stage.contains(position)[spring_lines.pairs].all(axis=1)
+    held = seen if spring_lines.held is None else seen & spring_lines.held[frame]
+    colours = spring_lines.colours().to_rgba(100 * spring_lines.strain(position)[held])
     width = float(np.clip(60 / np.sqrt(len(ends)), 0.5, 2.2))
-    drawn = [_collection(ends[held], colors=colours, linewidths=width, zorder=3)] if held.any() else []
+    drawn = [_build_collection(ends[held], colors=colours, linewidths=width, zorder=3)] if held.any() else []
     if (seen & ~held).any():
-        drawn.append(_collection(ends[seen & ~held], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2))
+        drawn.append(
+            _build_collection(ends[seen & ~held], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2)
+        )
     for collection in drawn:
         (ax.add_collection if scenery.flat else ax.add_collection3d)(collection)
     return (
         drawn
         if scenery.flat
-        else drawn + obstacles.solid(ax, scenery.stage, scenery.contacts, scenery.take.time[frame], scenery.up)
+        else drawn + obstacles.draw_balls(ax, scenery.stage, scenery.contacts, scenery.run.time[frame], scenery.up)
     )
 
 
-def colour_bar(figure: Any, where: dict[str, Any], *, strands: Strands) -> None:
+def draw_strain_bar(figure: Any, where: dict[str, Any], *, spring_lines: SpringLines) -> None:
     """What the colours mean, below all panels."""
-    bar_below(figure, where, strands.colours(), "strain [%]", extend="both")
+    draw_colour_bar(figure, where, spring_lines.colours(), "strain [%]", extend="both")
 
 
-def _collection(ends: np.ndarray, **style: Any) -> Any:
-    """Lines between ends `(lines, 2, dim)`."""
+def _build_collection(ends: np.ndarray, **style: Any) -> Any:
+    """Lines between ends `(draw_springs, 2, dim)`."""
     if ends.shape[-1] == 2:
         from matplotlib.collections import LineCollection
 

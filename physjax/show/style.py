@@ -7,12 +7,12 @@ from physjax.stepping.methods import METHODS
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
 """Okabe and Ito's colours, told apart by the colour-blind too; two more for methods to come."""
 MARKERS = "osD^vPX*"
-RIVALS = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
-PROJECTED = ", projected"
+RIVAL_STYLES = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
+PROJECTED_SUFFIX = ", projected"
 """What is added to a method's name where its touches are answered at the end of the step."""
-FLOAT32 = ", float32"
+FLOAT32_SUFFIX = ", float32"
 """What is added where it ran in float32."""
-ADAPTIVE = "adaptive "
+ADAPTIVE_PREFIX = "adaptive "
 """What stands before the name of a method that is subdivided."""
 
 
@@ -25,9 +25,9 @@ def style(method: str) -> dict[str, Any]:
         >>> plot.style("verlet")["marker"] != plot.style("euler")["marker"]
         True
     """
-    narrow = method.endswith(FLOAT32)
-    plain = method.removesuffix(FLOAT32)
-    name = plain.removesuffix(PROJECTED).removeprefix(ADAPTIVE)
+    narrow = method.endswith(FLOAT32_SUFFIX)
+    plain = method.removesuffix(FLOAT32_SUFFIX)
+    name = plain.removesuffix(PROJECTED_SUFFIX).removeprefix(ADAPTIVE_PREFIX)
     if name in METHODS:
         place = list(METHODS).index(name)
         line = {
@@ -37,10 +37,10 @@ def style(method: str) -> dict[str, Any]:
             "linewidth": 1.5,
             "markersize": 4.5,
         }
-        if plain.endswith(PROJECTED):
+        if plain.endswith(PROJECTED_SUFFIX):
             line |= {"linestyle": "--", "linewidth": 1.1, "markerfacecolor": "white"}
-        if plain.startswith(ADAPTIVE):
+        if plain.startswith(ADAPTIVE_PREFIX):
             line |= {"linestyle": "-.", "marker": "*", "markersize": 7}
         return line | {"alpha": 0.45, "linewidth": 1.0, "markersize": 3} if narrow else line
-    color, line = RIVALS.get(method, ("0.4", ":"))
+    color, line = RIVAL_STYLES.get(method, ("0.4", ":"))
     return {"color": color, "marker": ".", "linestyle": line, "linewidth": 1.2, "markersize": 5}

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from physjax.show import obstacles
-from physjax.show.frames import faces_of, picked, take
-from physjax.show.obstacles import LIGHT
-from physjax.show.panels import Scenery, panels, scenery_of
+from physjax.show.frames import get_faces, pick_frames, take_frames
+from physjax.show.obstacles import LIGHT_DIRECTION
+from physjax.show.panels import Scenery, build_scenery, draw_panels
 from physjax.trajectory import Trajectory
 
-AMBIENT = 0.5
+AMBIENT_BRIGHTNESS = 0.5
 """Brightness of a face that stands edge on to the light."""
-SMOOTH = 0.85
+SMOOTH_EDGE_COSINE = 0.85
 """Cosine of the angle up to which faces are drawn as one smooth surface."""
 
 
@@ -40,13 +40,15 @@ def cloth(
         2
     """
     who = "plot.cloth"
-    faces, nodes = faces_of(who, sheet)
-    seen = take(who, film, scene=scene, nodes=nodes, dims=(3,))
-    chosen = picked(who, seen, frames)
-    return panels(scenery_of(seen, chosen), chosen, partial(surface, faces=faces, color=color), figure)
+    faces, nodes = get_faces(who, sheet)
+    seen = take_frames(who, film, scene=scene, nodes=nodes, dims=(3,))
+    chosen = pick_frames(who, seen, frames)
+    return draw_panels(build_scenery(seen, chosen), chosen, partial(draw_surface, faces=faces, color=color), figure)
 
 
-def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any, closed: bool = False) -> list[Any]:
+def draw_surface(
+    ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any, closed: bool = False
+) -> list[Any]:
     """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them.
 
     Of what is `closed` the far side comes first: sorted by depth with the near one, some of it would show through.
@@ -55,14 +57,14 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     position = scenery.position(frame)
-    faces = faces[scenery.stage.holds(position)[faces].all(axis=1)]
-    triangles, colours = position[faces], brightness(position, faces, scenery.up)[:, None] * to_rgb(color)
-    balls = obstacles.balls(scenery.stage, scenery.contacts, scenery.take.time[frame])
-    layers = np.where(obstacles.hidden(balls, triangles.mean(axis=1), ax, scenery.up), 2, 4)
+    faces = faces[scenery.stage.contains(position)[faces].all(axis=1)]
+    triangles, colours = position[faces], compute_brightness(position, faces, scenery.up)[:, None] * to_rgb(color)
+    balls = obstacles.find_balls(scenery.stage, scenery.contacts, scenery.run.time[frame])
+    layers = np.where(obstacles.find_hidden(balls, triangles.mean(axis=1), ax, scenery.up), 2, 4)
     if closed:
-        layers[looks_away(triangles, ax)] = 1
+        layers[find_back_faces(triangles, ax)] = 1
     groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
-    groups += [(ball.corners, obstacles.shades(ball, scenery.up), 3) for ball in balls]
+    groups += [(ball.corners, obstacles.shade_ball(ball, scenery.up), 3) for ball in balls]
     drawn = [
         Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
         for polygons, shades, order in groups
@@ -73,7 +75,7 @@ def surface(ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: 
     return drawn
 
 
-def looks_away(triangles: np.ndarray, ax: Any) -> np.ndarray:
+def find_back_faces(triangles: np.ndarray, ax: Any) -> np.ndarray:
     """Which triangles `(n, 3, 3)` are seen from behind: their corners go round clockwise as the axes show them."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
@@ -82,7 +84,7 @@ def looks_away(triangles: np.ndarray, ax: Any) -> np.ndarray:
     return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
 
 
-def brightness(position: np.ndarray, faces: np.ndarray, up: int = 1) -> np.ndarray:
+def compute_brightness(position: np.ndarray, faces: np.ndarray, up: int = 1) -> np.ndarray:
     """Lambert's law, seen from both sides: ambient light and the rest times |n·l|, for each face.
 
     n at a corner is the mean of the faces around it, by area, so that a coarse sheet looks as smooth as it is meant;
@@ -93,8 +95,10 @@ def brightness(position: np.ndarray, faces: np.ndarray, up: int = 1) -> np.ndarr
     corners, weights = faces.ravel(), np.repeat(normal, 3, axis=0)
     around = np.stack([np.bincount(corners, weights[:, i], len(position)) for i in range(3)], axis=-1)
     own, mean = _unit(normal)[:, None], _unit(around)[faces]
-    smooth = (own * mean).sum(axis=-1, keepdims=True) > SMOOTH
-    return AMBIENT + (1 - AMBIENT) * np.abs(np.where(smooth, mean, own) @ obstacles.upright(LIGHT, up)).mean(axis=1)
+    smooth = (own * mean).sum(axis=-1, keepdims=True) > SMOOTH_EDGE_COSINE
+    return AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * np.abs(
+        np.where(smooth, mean, own) @ obstacles.orient_up(LIGHT_DIRECTION, up)
+    ).mean(axis=1)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -12,17 +12,17 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.backend import any_lane
-from physjax.checks import concrete, positive_integer, real_quantity
-from physjax.loops import Time, moment_at, now
-from physjax.particles import demand_particles, wide
+from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
+from physjax.loops import Time, moment_at, to_float_time
+from physjax.particles import append_axes, demand_particles
 from physjax.parts import as_module
 from physjax.scene import project
 from physjax.vectors import norm
 
-SAFETY, LECTURE_SAFETY, SHRINK, GROW = 0.8, 0.9, 0.2, 5.0
-LEAST = 1e-10
+SAFETY_FACTOR, LECTURE_SAFETY_FACTOR, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR = 0.8, 0.9, 0.2, 5.0
+NEGLIGIBLE_ERROR = 1e-10
 """An error, in units of the tolerance, that counts as none."""
-FLOOR = 1e-6
+SHORTEST_STEP_SHARE = 1e-6
 """The shortest step where none is given, in parts of the dt to be subdivided."""
 
 
@@ -59,7 +59,7 @@ class Adaptive(eqx.Module):
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
 
-    def checked(self, scene: Any) -> Any:
+    def check_scene(self, scene: Any) -> Any:
         """The scene as it is; a ValueError where something is answered once a dt, whatever the steps in it."""
         late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if hasattr(f, "advance")]
         late += [
@@ -79,18 +79,24 @@ class Adaptive(eqx.Module):
         """The state a dt later, with the counts of accepted and rejected steps."""
         shape, kind = getattr(system, "status_shape", ()), jax.tree.leaves(state)[0].dtype
         dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
-        floor = FLOOR * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
+        floor = SHORTEST_STEP_SHARE * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
         # less than rounding would never arrive
         floor = jnp.maximum(floor, 16 * jnp.finfo(kind).eps * dt)
         ceiling = dt if self.dt_max is None else jnp.minimum(self.dt_max.astype(kind), dt)
-        h = jnp.clip(self._first(system, t, state, dt), floor, ceiling)
+        h = jnp.clip(self._choose_first_step(system, t, state, dt), floor, ceiling)
         none = jnp.zeros(shape, jnp.int32)
-        start = _Walk(
+        start = _Progress(
             state=state, elapsed=jnp.zeros(shape, kind), h=lax.stop_gradient(h), accepted=none, rejected=none, shortest=dt,
             failed=jnp.zeros(shape, bool), last=jnp.full(shape, jnp.inf, kind), error=jnp.ones(shape, kind),
         )  # fmt: skip
         attempt = partial(
-            self._attempt, system, t, dt, partial(_next_stop, _jumps(system, t, shape), dt), floor, ceiling
+            self._attempt_step,
+            system,
+            t,
+            dt,
+            partial(_find_next_stop, _find_jumps(system, t, shape), dt),
+            floor,
+            ceiling,
         )
         if self.tries is None:
             end = lax.while_loop(lambda walk: any_lane(walk.going(dt)), attempt, start)
@@ -101,12 +107,14 @@ class Adaptive(eqx.Module):
         legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, jax.core.Tracer)]
         ok = reduce(jnp.logical_and, legal, ~end.failed & ~end.going(dt))
         # a product and no choice: the derivatives of what is not a number are none either, where a choice would say zero
-        state = jax.tree.map(lambda leaf: leaf * wide(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state)
+        state = jax.tree.map(
+            lambda leaf: leaf * append_axes(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state
+        )
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
-    def _attempt(
-        self, system: Any, t: Any, dt: Any, next_stop: Callable, floor: Any, ceiling: Any, walk: "_Walk"
-    ) -> "_Walk":
+    def _attempt_step(
+        self, system: Any, t: Any, dt: Any, next_stop: Callable, floor: Any, ceiling: Any, walk: "_Progress"
+    ) -> "_Progress":
         """One step whole and in halves, kept if both agree, and the next length from how well they do."""
         stop = next_stop(walk.elapsed)
         going, left = walk.going(dt), stop - walk.elapsed
@@ -115,17 +123,17 @@ class Adaptive(eqx.Module):
         h = jnp.where(last, left, jnp.where(2 * walk.h > left, left / 2, walk.h))
         h = jnp.where(going, h, 0.0)
         begun = t + walk.elapsed
-        whole = self._stepped(system, begun, walk.state, h)
-        middle = self._stepped(system, begun, walk.state, h / 2)
-        halves = self._stepped(system, begun + h / 2, middle, h / 2)
-        error = lax.stop_gradient(self._error(walk.state, whole, halves, h.shape))
+        whole = self._take_step(system, begun, walk.state, h)
+        middle = self._take_step(system, begun, walk.state, h / 2)
+        halves = self._take_step(system, begun + h / 2, middle, h / 2)
+        error = lax.stop_gradient(self._measure_error(walk.state, whole, halves, h.shape))
         good = going & (error <= 1.0)
         bad = going & ~good
-        factor = self._factor(walk, h, error, good)
+        factor = self._choose_factor(walk, h, error, good)
         # cut short by the end, a step says little about how long the next may be
         longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
-        return _Walk(
-            state=jax.tree.map(lambda a, b: jnp.where(wide(good, a), a, b), halves, walk.state),
+        return _Progress(
+            state=jax.tree.map(lambda a, b: jnp.where(append_axes(good, a), a, b), halves, walk.state),
             elapsed=jnp.where(good, jnp.where(last, stop, walk.elapsed + h), walk.elapsed),
             h=jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
             accepted=walk.accepted + good.astype(jnp.int32),
@@ -136,57 +144,59 @@ class Adaptive(eqx.Module):
             error=jnp.where(good, error, walk.error),
         )
 
-    def _stepped(self, system: Any, t: Any, state: Any, h: Any) -> Any:
+    def _take_step(self, system: Any, t: Any, state: Any, h: Any) -> Any:
         """One step of the method, with what jumps in time replaced by its mean over the step."""
-        if hasattr(system, "during"):
+        if hasattr(system, "averaged_over_step"):
             # over no time there is no mean, and what is not a number would come back in a derivative
-            system = system.during(t, jnp.where(h > 0, h, 1.0))
+            system = system.averaged_over_step(t, jnp.where(h > 0, h, 1.0))
         return self.method(system, t, state, h)
 
-    def _factor(self, walk: "_Walk", h: Array, error: Array, good: Array) -> Array:
+    def _choose_factor(self, walk: "_Progress", h: Array, error: Array, good: Array) -> Array:
         """By how much longer the next step may be: as this error allows, or less where errors have been growing.
 
         The trend, from the accepted step before, is K. Gustafsson's (1994; Hairer and Wanner, section IV.8): without it
         a fifth of all tries is rejected where a body falls towards another, as each step is harder than the last.
         """
         if self.error == "velocity":
-            factor = LECTURE_SAFETY * jnp.maximum(error, LEAST) ** -0.5
+            factor = LECTURE_SAFETY_FACTOR * jnp.maximum(error, NEGLIGIBLE_ERROR) ** -0.5
         else:
             power = 1 / (self.order + 1)
-            now, before = jnp.maximum(error, LEAST), jnp.maximum(walk.error, LEAST)
-            factor = SAFETY * now**-power
+            now, before = jnp.maximum(error, NEGLIGIBLE_ERROR), jnp.maximum(walk.error, NEGLIGIBLE_ERROR)
+            factor = SAFETY_FACTOR * now**-power
             # no step before: its length is infinite, and nothing is known
             trend = jnp.where(jnp.isfinite(walk.last), h / walk.last * (before / now) ** power, 1.0)
             factor = jnp.where(good, factor * jnp.minimum(trend, 1.0), factor)
-        return jnp.where(jnp.isfinite(error), jnp.clip(factor, SHRINK, GROW), SHRINK)
+        return jnp.where(
+            jnp.isfinite(error), jnp.clip(factor, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR), SMALLEST_STEP_FACTOR
+        )
 
-    def _error(self, start: Any, whole: Any, halves: Any, shape: tuple) -> Array:
+    def _measure_error(self, start: Any, whole: Any, halves: Any, shape: tuple) -> Array:
         """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
         if self.error == "velocity":
             demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
             worst = norm(halves.velocity - whole.velocity)
-            return _worst(worst, shape) / self.atol.astype(worst.dtype)
-        return _size(jax.tree.map(lambda a, b: a - b, halves, whole), self._tolerance(start, halves), shape)
+            return _max_over_shared_step(worst, shape) / self.atol.astype(worst.dtype)
+        return _scaled_norm(jax.tree.map(lambda a, b: a - b, halves, whole), self._tolerance(start, halves), shape)
 
     def _tolerance(self, start: Any, end: Any) -> Any:
         size = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), start, end)
         return jax.tree.map(lambda s: self.atol.astype(s.dtype) + self.rtol.astype(s.dtype) * s, size)
 
-    def _first(self, system: Any, t: Any, state: Any, dt: Any) -> Array:
+    def _choose_first_step(self, system: Any, t: Any, state: Any, dt: Any) -> Array:
         """A first length from how fast the state and its rate change (Hairer, Nørsett, Wanner, section II.4)."""
         shape, tolerance = dt.shape, self._tolerance(state, state)
         slope = system.rate(t, state)
-        size, speed = _size(state, tolerance, shape), _size(slope, tolerance, shape)
+        size, speed = _scaled_norm(state, tolerance, shape), _scaled_norm(slope, tolerance, shape)
         small = 0.01 * jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1.0), 1e30)
-        small = jnp.clip(small, FLOOR * dt, dt)
-        ahead = jax.tree.map(lambda y, k: y + wide(small, y) * k, state, slope)
+        small = jnp.clip(small, SHORTEST_STEP_SHARE * dt, dt)
+        ahead = jax.tree.map(lambda y, k: y + append_axes(small, y) * k, state, slope)
         turn = jax.tree.map(lambda a, b: a - b, system.rate(t + small, ahead), slope)
-        bend = jnp.maximum(_size(turn, tolerance, shape) / small, 1e-30)
+        second_derivative = jnp.maximum(_scaled_norm(turn, tolerance, shape) / small, 1e-30)
         # half of y'' dt² is what a step of first order misses
-        return jnp.minimum(100 * small, (0.01 / jnp.maximum(bend, speed)) ** (1 / (self.order + 1)))
+        return jnp.minimum(100 * small, (0.01 / jnp.maximum(second_derivative, speed)) ** (1 / (self.order + 1)))
 
 
-class _Walk(NamedTuple):
+class _Progress(NamedTuple):
     """How far the steps have come; `last` and `error` are of the last step accepted."""
 
     state: Any
@@ -221,7 +231,7 @@ def adaptive(
     keeps the halves, otherwise the step is redone; the next is 0.8 E^(-1/(p+1)) times as long, p the method's order, at
     most 5 times, and less where the error has been growing. Every independent lane has steps of its own, and all land
     exactly on the end of dt: 3 times the evaluations of the method a try, and two to begin a dt with, so give it long
-    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`); a jump of one's own that neither `during` nor
+    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`); a jump of one's own that neither `averaged_over_step` nor
     `discontinuities` tells (see `Force`) can be stepped over. Forces that remember and touches answered by
     `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
     Timed touches count by dt as well: a flight shorter than a quarter of dt is the last before rest, and after eight
@@ -247,11 +257,12 @@ def adaptive(
     promised = getattr(method, "promises", None)
     if order is None and promised is None:
         raise ValueError("adaptive: the method promises no order. Give order=.")
-    atol, rtol = real_quantity("atol", atol, above=0.0), real_quantity("rtol", rtol, above=0.0)
+    atol, rtol = as_real_quantity("atol", atol, above=0.0), as_real_quantity("rtol", rtol, above=0.0)
     dt_min, dt_max = (
-        None if h is None else real_quantity(name, h, above=0.0) for name, h in (("dt_min", dt_min), ("dt_max", dt_max))
+        None if h is None else as_real_quantity(name, h, above=0.0)
+        for name, h in (("dt_min", dt_min), ("dt_max", dt_max))
     )
-    known = [concrete(h) for h in (dt_min, dt_max) if h is not None]
+    known = [concrete_or_none(h) for h in (dt_min, dt_max) if h is not None]
     if len(known) == 2 and all(h is not None for h in known) and known[0] > known[1]:
         raise ValueError(f"dt_min: got {known[0]:g} s, which is more than dt_max {known[1]:g} s. Exchange them.")
     return Adaptive(
@@ -260,9 +271,9 @@ def adaptive(
         rtol,
         dt_min,
         dt_max,
-        positive_integer("order", promised.order if order is None else order),
+        as_positive_integer("order", promised.order if order is None else order),
         error,
-        None if tries is None else positive_integer("tries", tries),
+        None if tries is None else as_positive_integer("tries", tries),
     )
 
 
@@ -276,36 +287,36 @@ def count_steps(scene: Any, method: Adaptive, *, dt: ArrayLike, steps: int) -> S
     """
     if not isinstance(method, Adaptive):
         raise TypeError(f"count_steps: got {type(method).__name__}, expected methods.adaptive(...).")
-    return _counted(scene, method, real_quantity("dt [s]", dt, above=0.0), positive_integer("steps", steps))
+    return _count_steps(scene, method, as_real_quantity("dt [s]", dt, above=0.0), as_positive_integer("steps", steps))
 
 
 @eqx.filter_jit
-def _counted(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
+def _count_steps(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
     dt = dt.astype(scene.state.dtype)
     arrays, still = eqx.partition(scene, eqx.is_array)
 
     def one(arrays, i):
         scene = eqx.combine(arrays, still)
         t = moment_at(i, dt, scene.state.dtype)
-        told = method.report(scene, t, scene.state, dt)
+        reported = method.report(scene, t, scene.state, dt)
         after = scene.step(method, t, dt)
-        return eqx.filter(after, eqx.is_array), told._replace(state=after.state)
+        return eqx.filter(after, eqx.is_array), reported._replace(state=after.state)
 
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
 
 
-def _jumps(system: Any, t: Time, shape: tuple) -> list[Array]:
+def _find_jumps(system: Any, t: Time, shape: tuple) -> list[Array]:
     """When forces of a system jump, after t [s]: `(*shape, k)` each."""
     found = []
     for force in getattr(system, "forces", ()):
         for times in map(jnp.asarray, getattr(force, "discontinuities", tuple)()):
             own = shape and times.shape[: len(shape)] == shape
             times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
-            found.append(times - jnp.broadcast_to(now(t), shape)[..., None])
+            found.append(times - jnp.broadcast_to(to_float_time(t), shape)[..., None])
     return found
 
 
-def _next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
+def _find_next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
     """The end of dt, or the first jump before it that has not been reached."""
     for times in jumps:
         ahead = jnp.where(times > elapsed[..., None], times, jnp.inf)
@@ -313,14 +324,14 @@ def _next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
     return dt
 
 
-def _size(state: Any, tolerance: Any, shape: tuple) -> Array:
+def _scaled_norm(state: Any, tolerance: Any, shape: tuple) -> Array:
     """The largest component in units of its tolerance, for each scene or lane."""
     leaves = [jnp.abs(a / b) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(tolerance), strict=True)]
     largest = reduce(jnp.maximum, [leaf[..., i] for leaf in leaves for i in range(leaf.shape[-1])])
-    return _worst(largest, shape)
+    return _max_over_shared_step(largest, shape)
 
 
-def _worst(number: Array, shape: tuple) -> Array:
+def _max_over_shared_step(number: Array, shape: tuple) -> Array:
     """The largest number of all lanes that share a step."""
     return jnp.max(number, axis=tuple(range(len(shape), number.ndim)))
 

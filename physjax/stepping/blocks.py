@@ -14,11 +14,11 @@ from jax import lax
 
 from physjax.scene import Scene
 
-BLOCK = 8192
+LANES_PER_BLOCK = 8192
 """Lanes in a block: 200 kB of state in 3-D and float32, which leaves room for the stages of a step in a 1 MB cache."""
-SMALLEST = 6 * BLOCK
+MIN_LANES_TO_CUT = 6 * LANES_PER_BLOCK
 """Fewer lanes than this fit a cache as they are."""
-FEWEST_STEPS = 8
+MIN_STEPS_PER_FRAME = 8
 """Fewer steps between frames do not pay for cutting."""
 
 
@@ -37,26 +37,31 @@ class Blocks(NamedTuple):
         arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)
-        if total < SMALLEST or frame_steps < FEWEST_STEPS or jax.default_backend() != "cpu" or not scene.may_be_cut():
+        if (
+            total < MIN_LANES_TO_CUT
+            or frame_steps < MIN_STEPS_PER_FRAME
+            or jax.default_backend() != "cpu"
+            or not scene.may_be_cut()
+        ):
             return None
-        count = math.ceil(total / BLOCK)
+        count = math.ceil(total / LANES_PER_BLOCK)
         blocks = cls(scene.state.lanes, math.ceil(total / count), count)
-        return blocks if all(jax.tree.leaves(scene.lane_mask(moving))) else None
+        return blocks if all(jax.tree.leaves(scene.build_lane_mask(moving))) else None
 
     def cut(self, tree: Any) -> Any:
         """Trees of per-lane arrays as `(count, size, ...)`."""
-        return jax.tree.map(self._cut, tree)
+        return jax.tree.map(self._cut_leaf, tree)
 
     def join(self, tree: Any, leading: int = 0) -> Any:
         """Undo `cut`, behind `leading` further axes."""
-        return jax.tree.map(lambda leaf: self._join(leaf, leading), tree)
+        return jax.tree.map(lambda leaf: self._join_leaf(leaf, leading), tree)
 
     def map(self, function: Callable, blocked: Any, *others: Any, masks: Any) -> Any:
         """`function(block, *others)` for each block in turn; `others` are uncut trees, of which it sees the block's part.
 
         `masks` say which of their arrays have an entry for each lane.
         """
-        cut = lambda leaf, has_lanes: self._cut(leaf) if has_lanes else None  # noqa: E731
+        cut = lambda leaf, has_lanes: self._cut_leaf(leaf) if has_lanes else None  # noqa: E731
         parts = [jax.tree.map(cut, other, mask) for other, mask in zip(others, masks, strict=True)]
 
         def one(slices):
@@ -71,13 +76,13 @@ class Blocks(NamedTuple):
 
         return lax.map(one, (blocked, *parts))
 
-    def _cut(self, leaf: Any) -> Any:
+    def _cut_leaf(self, leaf: Any) -> Any:
         n = len(self.lanes)
         flat = leaf.reshape((-1, *leaf.shape[n:]))
         filled = jnp.concatenate([flat, flat[: self.count * self.size - flat.shape[0]]])
         return filled.reshape((self.count, self.size, *leaf.shape[n:]))
 
-    def _join(self, leaf: Any, leading: int) -> Any:
+    def _join_leaf(self, leaf: Any, leading: int) -> Any:
         front, rest = leaf.shape[:leading], leaf.shape[leading + 2 :]
         flat = leaf.reshape((*front, self.count * self.size, *rest))
         total = math.prod(self.lanes)

@@ -16,13 +16,19 @@ from jax.typing import ArrayLike
 
 from physjax.backend import any_lane
 from physjax.loops import Time
-from physjax.stepping.krylov import Solved, Vector, conjugate_gradients, solved, stabilised_biconjugate_gradients
+from physjax.stepping.krylov import (
+    SolveReport,
+    Vector,
+    build_report,
+    conjugate_gradients,
+    stabilised_biconjugate_gradients,
+)
 from physjax.stepping.registry import Promises
 from physjax.vectors import scale
 
-ROUGH, FORCING = 0.1, 1e-3
+LARGEST_FORCING_TERM, SMALLEST_FORCING_TERM = 0.1, 1e-3
 """Relative residuals of the linear systems around Newton's method: of the first guess, and three digits an iteration."""
-HALVINGS = 8
+MAX_HALVINGS = 8
 """How often a Newton step that does not lower the residual is halved before it is given up."""
 
 
@@ -32,7 +38,7 @@ class ImplicitEuler(eqx.Module):
     Damps an oscillation by 1/√(1 + ω²dt²) a step, whether that is meant or not. Once a step the force is linearised
     (`newton` = 0); `newton` > 0 converges the full equation in at most so many steps of Newton's method. Independent
     lanes solve a small system each, coupled scenes one for each scene by at most `iterations` products with its matrix:
-    conjugate gradients where every force always pushes back (springs do, by their `near`), BiCGSTAB otherwise.
+    conjugate gradients where every force always pushes back (springs do, by their `linearised_at`), BiCGSTAB otherwise.
     `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass: √ε of the float type by
     default. A solve that does not converge raises nothing: `report` says so, with its residual. Derivatives go through
     the solution, not the iterations. Raises ValueError or TypeError for bad settings.
@@ -46,7 +52,7 @@ class ImplicitEuler(eqx.Module):
     iterations: int = eqx.field(static=True, default=1000)
     newton: int = eqx.field(static=True, default=0)
 
-    promises = Promises(order=1, evaluations=1, stable_to=float("inf"), order_with_drag=1)
+    promises = Promises(order=1, evaluations=1, stability_limit=float("inf"), order_with_drag=1)
 
     def __check_init__(self):
         given = 0.5 if self.tolerance is None else self.tolerance
@@ -65,84 +71,88 @@ class ImplicitEuler(eqx.Module):
 
     def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         """The state after a step dt [s] from the time t [s]."""
-        return self._step(system, t, state, dt)[0]
+        return self._take_step(system, t, state, dt)[0]
 
-    def report(self, scene: Any, dt: ArrayLike, t: ArrayLike = 0.0) -> Solved:
+    def report(self, scene: Any, dt: ArrayLike, t: ArrayLike = 0.0) -> SolveReport:
         """How the step from `scene.state` is solved: relative residual, products with the matrix, ok; for each scene."""
-        return _reported(self, scene, jnp.asarray(t, scene.state.dtype), jnp.asarray(dt, scene.state.dtype))
+        return _report_step(self, scene, jnp.asarray(t, scene.state.dtype), jnp.asarray(dt, scene.state.dtype))
 
-    def _step(self, system, t, state, dt):
+    def _take_step(self, system, t, state, dt):
         step = _Step.of(system, t, state, dt)
         if self.newton:
-            guess, _ = self._linearised(step, ROUGH)
-            u, told = self._converged(step, lax.stop_gradient(guess))
+            guess, _ = self._solve_linearised(step, LARGEST_FORCING_TERM)
+            u, reported = self._solve_converged(step, lax.stop_gradient(guess))
         else:
-            u, told = self._linearised(step, 0.0)
-        return step.ended(u), told
+            u, reported = self._solve_linearised(step, 0.0)
+        return step.end_state(u), reported
 
-    def _linearised(self, step: "_Step", rough: float) -> tuple[Vector, Solved]:
+    def _solve_linearised(self, step: "_Step", rough: float) -> tuple[Vector, SolveReport]:
         """u from the equation linearised at the start of the step."""
-        near, state, dt = step.near(), step.state, step.dt
-        rate, push = jax.linearize(lambda y: near.rate(step.end, y), state)
+        linearised, state, dt = step.linearised(), step.state, step.dt
+        rate, push = jax.linearize(lambda y: linearised.rate(step.end, y), state)
         _, ahead = jax.jvp(lambda h: step.system.drift(state, h), (jnp.zeros_like(dt),), (dt,))
-        _, move = jax.linearize(lambda u: step.system.drift(step.kicked_by(u), dt), step.nothing())
+        _, move = jax.linearize(lambda u: step.system.drift(step.add_change(u), dt), step.zero_change())
         b = step.kick(jax.tree.map(jnp.add, rate, push(ahead)))
-        matvec = lambda u: _minus(u, step.kick(push(move(step.freed(u)))))  # noqa: E731
-        return self._solve(step, matvec, b, max(rough, self._floor(b)), getattr(near, "definite", False))
+        matvec = lambda u: _subtract(u, step.kick(push(move(step.mask_held(u)))))  # noqa: E731
+        return self._solve_linear(
+            step, matvec, b, max(rough, self._limit_tolerance(b)), getattr(linearised, "dissipative_symmetric", False)
+        )
 
-    def _converged(self, step: "_Step", guess: Vector) -> tuple[Vector, Solved]:
+    def _solve_converged(self, step: "_Step", guess: Vector) -> tuple[Vector, SolveReport]:
         """u from the full equation, by Newton's method from a guess; its derivative by the implicit function theorem."""
 
         def residual(u):
-            return _minus(u, step.kick(step.system.rate(step.end, step.ended(u))))
+            return _subtract(u, step.kick(step.system.rate(step.end, step.end_state(u))))
 
         def tangent(g, y):
-            return self._solve(step, g, y, self._floor(y), False)[0]
+            return self._solve_linear(step, g, y, self._limit_tolerance(y), False)[0]
 
         def solve(f, u):
-            u, told = self._newton(step, f, u)
+            u, reported = self._iterate_newton(step, f, u)
             # as floats: jax 0.10 differentiates what comes along, and numbers that count have no derivative
-            return u, [leaf.astype(u[0].dtype) for leaf in told]
+            return u, [leaf.astype(u[0].dtype) for leaf in reported]
 
         u, (relative, products, ok) = lax.custom_root(residual, guess, solve, tangent, has_aux=True)
-        return u, Solved(relative, products.astype(jnp.int32), ok > 0)
+        return u, SolveReport(relative, products.astype(jnp.int32), ok > 0)
 
-    def _newton(self, step: "_Step", residual: Callable, u: Vector) -> tuple[Vector, Solved]:
-        zero = residual(step.nothing())
+    def _iterate_newton(self, step: "_Step", residual: Callable, u: Vector) -> tuple[Vector, SolveReport]:
+        zero = residual(step.zero_change())
         size = step.inner(zero, zero)
-        goal = self._floor(u) ** 2 * size
+        goal = self._limit_tolerance(u) ** 2 * size
 
         def body(carry):
             u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
             # no more digits than are still missing
             missing = jnp.sqrt(goal / jnp.where(square > 0, square, 1.0))
-            change, told = self._solve(step, tangent, r, jnp.clip(0.1 * missing, FORCING, ROUGH), False)
-            u, after = _searched(step, residual, u, change, square, going)
-            count = count + jnp.where(going, told.products, 0)
+            change, reported = self._solve_linear(
+                step, tangent, r, jnp.clip(0.1 * missing, SMALLEST_FORCING_TERM, LARGEST_FORCING_TERM), False
+            )
+            u, after = _search_line(step, residual, u, change, square, going)
+            count = count + jnp.where(going, reported.products, 0)
             return u, after, going & (after > goal) & (after < square), count, i + 1
 
         r = residual(u)
         square = step.inner(r, r)
         start = (u, square, square > goal, jnp.zeros(size.shape, jnp.int32), jnp.zeros((), jnp.int32))
         u, square, _, count, _ = lax.while_loop(lambda c: any_lane(c[2]) & (c[-1] < self.newton), body, start)
-        return u, solved(square, size, goal, count)
+        return u, build_report(square, size, goal, count)
 
-    def _floor(self, b: Vector) -> float:
+    def _limit_tolerance(self, b: Vector) -> float:
         """The tolerance, or what rounding leaves of it."""
         eps = float(jnp.finfo(b[0].dtype).eps)
         return eps**0.5 if self.tolerance is None else max(self.tolerance, 4 * eps)
 
-    def _solve(
-        self, step: "_Step", matvec: Callable, b: Vector, tolerance: ArrayLike, definite: bool
-    ) -> tuple[Vector, Solved]:
+    def _solve_linear(
+        self, step: "_Step", matvec: Callable, b: Vector, tolerance: ArrayLike, dissipative_symmetric: bool
+    ) -> tuple[Vector, SolveReport]:
         """matvec(u) = b: in closed form where lanes stand alone, else iteratively."""
-        if step.alone and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED:
-            u = _lane_by_lane(matvec, b[0])
-            r, size = _minus(b, matvec([u])), step.inner(b, b)
+        if step.is_independent and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED_FORMS:
+            u = _solve_per_lane(matvec, b[0])
+            r, size = _subtract(b, matvec([u])), step.inner(b, b)
             products = jnp.full(size.shape, b[0].shape[-1], jnp.int32)
-            return [u], solved(step.inner(r, r), size, tolerance**2 * size, products)
-        iterate = conjugate_gradients if definite else stabilised_biconjugate_gradients
+            return [u], build_report(step.inner(r, r), size, tolerance**2 * size, products)
+        iterate = conjugate_gradients if dissipative_symmetric else stabilised_biconjugate_gradients
 
         def solve(matvec, b):
             return iterate(matvec, b, step.inner, tolerance, self.iterations)
@@ -160,59 +170,59 @@ class _Step(NamedTuple):
     end: Time
     state: Any
     dt: ArrayLike
-    places: tuple[bool, ...]
+    kicked_leaves: tuple[bool, ...]
 
     @classmethod
     def of(cls, system: Any, t: Time, state: Any, dt: ArrayLike) -> "_Step":
-        places = []
+        kicked_leaves = []
 
         def kick(state):
             after = system.kick(state, state, dt)
             pairs = zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True)
-            places.extend(before is not now for before, now in pairs)
+            kicked_leaves.extend(before is not now for before, now in pairs)
             return after
 
         jax.eval_shape(kick, state)
         dtype = jax.tree.leaves(state)[0].dtype
-        return cls(system, t + dt, state, jnp.asarray(dt, dtype), tuple(places))
+        return cls(system, t + dt, state, jnp.asarray(dt, dtype), tuple(kicked_leaves))
 
     @property
-    def alone(self) -> bool:
+    def is_independent(self) -> bool:
         """Whether each lane is a system of its own."""
         return not getattr(self.system, "couples", True) or getattr(self.state, "lanes", None) == ()
 
-    def near(self) -> Any:
+    def linearised(self) -> Any:
         """The system that is linearised."""
-        return self.system.near(self.end, self.state) if hasattr(self.system, "near") else self.system
+        return self.system.linearised_at(self.end, self.state) if hasattr(self.system, "linearised_at") else self.system
 
-    def picked(self, tree: Any) -> Vector:
+    def select_kicked(self, tree: Any) -> Vector:
         """The leaves of a state that a kick changes."""
-        return [leaf for leaf, place in zip(jax.tree.leaves(tree), self.places, strict=True) if place]
+        return [leaf for leaf, place in zip(jax.tree.leaves(tree), self.kicked_leaves, strict=True) if place]
 
     def kick(self, rate: Any) -> Vector:
         """dt·rate, of the leaves that a kick changes."""
-        return self.picked(self.system.kick(jax.tree.map(jnp.zeros_like, self.state), rate, self.dt))
+        return self.select_kicked(self.system.kick(jax.tree.map(jnp.zeros_like, self.state), rate, self.dt))
 
-    def nothing(self) -> Vector:
+    def zero_change(self) -> Vector:
         """No change."""
-        return [jnp.zeros_like(leaf) for leaf in self.picked(self.state)]
+        return [jnp.zeros_like(leaf) for leaf in self.select_kicked(self.state)]
 
-    def freed(self, u: Vector) -> Vector:
+    def mask_held(self, u: Vector) -> Vector:
         """u without what held lanes have of it, which is nothing: the matrix then is symmetric in them as well."""
         held = getattr(self.system, "held", None)
         return u if held is None else [scale(1 - held.astype(leaf.dtype), leaf) for leaf in u]
 
-    def kicked_by(self, u: Vector) -> Any:
+    def add_change(self, u: Vector) -> Any:
         """The state with u added to what a kick changes."""
         leaves, tree = jax.tree.flatten(self.state)
         more = iter(u)
         return jax.tree.unflatten(
-            tree, [leaf + next(more) if place else leaf for leaf, place in zip(leaves, self.places, strict=True)]
+            tree, [leaf + next(more) if place else leaf for leaf, place in zip(leaves, self.kicked_leaves, strict=True)]
         )
 
-    def ended(self, u: Vector) -> Any:
+    def end_state(self, u: Vector) -> Any:
         """The state at the end of the step."""
-        return self.system.drift(self.kicked_by(u), self.dt)
+        return self.system.drift(self.add_change(u), self.dt)
 
     def inner(self, a: Vector, b: Vector) -> jax.Array:
         """Σ m a·b for each system."""
@@ -228,19 +238,19 @@ class _Step(NamedTuple):
 
     def _sum(self, a, b):
         kept = len(getattr(self.system, "status_shape", ()))
-        return sum(_total(p * q, kept) for p, q in zip(a, b, strict=True))
+        return sum(_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True))
 
 
-def _total(a: jax.Array, kept: int) -> jax.Array:
+def _sum_trailing_axes(a: jax.Array, kept: int) -> jax.Array:
     """The sum over all axes but the first `kept`."""
     return jnp.sum(a, axis=tuple(range(kept, a.ndim)))
 
 
-def _minus(a: Vector, b: Vector) -> Vector:
+def _subtract(a: Vector, b: Vector) -> Vector:
     return [p - q for p, q in zip(a, b, strict=True)]
 
 
-def _searched(step, residual, u, change, square, going):
+def _search_line(step, residual, u, change, square, going):
     """u - change, each system's change halved until its residual falls, left out where that does not help."""
 
     def tried(share):
@@ -255,18 +265,20 @@ def _searched(step, residual, u, change, square, going):
 
     whole = going.astype(square.dtype)
     start = (whole, tried(whole), jnp.zeros((), jnp.int32))
-    share, found, _ = lax.while_loop(lambda c: any_lane(going & ~(c[1] < square)) & (c[-1] < HALVINGS), halve, start)
+    share, found, _ = lax.while_loop(
+        lambda c: any_lane(going & ~(c[1] < square)) & (c[-1] < MAX_HALVINGS), halve, start
+    )
     share = jnp.where(found < square, share, 0.0)
     new = [a - scale(share, b) for a, b in zip(u, change, strict=True)]
     return new, jnp.where(found < square, found, square)
 
 
-def _lane_by_lane(matvec: Callable, b: jax.Array) -> jax.Array:
+def _solve_per_lane(matvec: Callable, b: jax.Array) -> jax.Array:
     """The solution of a small system for each lane, by Cramer's rule."""
     dim = b.shape[-1]
     units = [jnp.broadcast_to(jnp.eye(dim, dtype=b.dtype)[i], b.shape) for i in range(dim)]
     columns = [[matvec([e])[0][..., i] for i in range(dim)] for e in units]
-    return jnp.stack(_CLOSED[dim](columns, [b[..., i] for i in range(dim)]), axis=-1)
+    return jnp.stack(_CLOSED_FORMS[dim](columns, [b[..., i] for i in range(dim)]), axis=-1)
 
 
 def _cramer_1(columns, b):
@@ -291,9 +303,9 @@ def _cramer_3(columns, b):
     return [det(b, q, r) / whole, det(p, b, r) / whole, det(p, q, b) / whole]
 
 
-_CLOSED = {1: _cramer_1, 2: _cramer_2, 3: _cramer_3}
+_CLOSED_FORMS = {1: _cramer_1, 2: _cramer_2, 3: _cramer_3}
 
 
 @jax.jit
-def _reported(method: ImplicitEuler, scene: Any, t: jax.Array, dt: jax.Array) -> Solved:
-    return method._step(scene.during(t, dt), t, scene.state, dt)[1]
+def _report_step(method: ImplicitEuler, scene: Any, t: jax.Array, dt: jax.Array) -> SolveReport:
+    return method._take_step(scene.averaged_over_step(t, dt), t, scene.state, dt)[1]

@@ -17,11 +17,11 @@ from physjax.backend import any_lane
 from physjax.vectors import scale
 
 Vector = list[Array]
-LOOKS = 4
+MAX_RESIDUAL_CHECKS = 4
 """How often a system that believes it is done is looked at; in float32 it may go on from there."""
 
 
-class Solved(NamedTuple):
+class SolveReport(NamedTuple):
     """How a solve went: relative residual, products with the matrix, and whether the residual is what was asked for."""
 
     residual: Float[Array, "..."]
@@ -31,7 +31,7 @@ class Solved(NamedTuple):
 
 def conjugate_gradients(
     matvec: Callable[[Vector], Vector], b: Vector, inner: Callable, tolerance: ArrayLike, most: int
-) -> tuple[Vector, Solved]:
+) -> tuple[Vector, SolveReport]:
     """A x = b for A self-adjoint in `inner` and positive: one product an iteration (Hestenes and Stiefel 1952).
 
     Stops at a direction along which A is not positive, and after `most` products.
@@ -42,27 +42,27 @@ def conjugate_gradients(
     def body(carry):
         x, r, p, square, going, count, looks, i = carry
         q = matvec(p)
-        bend = inner(p, q)
-        going = going & (bend > 0)
-        alpha = _ratio(square, bend, going)
-        x, r = _plus(x, alpha, p), _plus(r, -alpha, q)
+        curvature = inner(p, q)
+        going = going & (curvature > 0)
+        alpha = _safe_ratio(square, curvature, going)
+        x, r = _add_scaled(x, alpha, p), _add_scaled(r, -alpha, q)
         after = inner(r, r)
         looked = (going & (after <= goal) & (looks > 0)).astype(jnp.int32)
-        r, after = _looked_at(looked, matvec, b, x, r, after, inner)
-        p = _plus(r, _ratio(after, square, going & (looked == 0)), p)
+        r, after = _recompute_residual(looked, matvec, b, x, r, after, inner)
+        p = _add_scaled(r, _safe_ratio(after, square, going & (looked == 0)), p)
         count = count + going.astype(jnp.int32) + looked
         return x, r, p, jnp.where(going, after, square), going & (after > goal), count, looks - looked, i + 1
 
     none = jnp.zeros(size.shape, jnp.int32)
     zero = [jnp.zeros_like(e) for e in b]
-    start = (zero, b, b, size, size > goal, none, none + LOOKS, jnp.zeros((), jnp.int32))
+    start = (zero, b, b, size, size > goal, none, none + MAX_RESIDUAL_CHECKS, jnp.zeros((), jnp.int32))
     x, _, _, square, _, count, _, _ = lax.while_loop(lambda c: any_lane(c[4]) & (c[-1] < most), body, start)
-    return x, solved(square, size, goal, count)
+    return x, build_report(square, size, goal, count)
 
 
 def stabilised_biconjugate_gradients(
     matvec: Callable[[Vector], Vector], b: Vector, inner: Callable, tolerance: ArrayLike, most: int
-) -> tuple[Vector, Solved]:
+) -> tuple[Vector, SolveReport]:
     """A x = b for any A that is not too far from 1: two products an iteration (BiCGSTAB, van der Vorst 1992)."""
     size = inner(b, b)
     goal = tolerance**2 * size
@@ -70,30 +70,30 @@ def stabilised_biconjugate_gradients(
     def body(carry):
         x, r, p, rho, square, going, count, looks, i = carry
         v = matvec(p)
-        alpha = _ratio(rho, inner(b, v), going)
-        s = _plus(r, -alpha, v)
+        alpha = _safe_ratio(rho, inner(b, v), going)
+        s = _add_scaled(r, -alpha, v)
         w = matvec(s)
-        omega = _ratio(inner(w, s), inner(w, w), going)
-        x = _plus(_plus(x, alpha, p), omega, s)
-        r = _plus(s, -omega, w)
+        omega = _safe_ratio(inner(w, s), inner(w, w), going)
+        x = _add_scaled(_add_scaled(x, alpha, p), omega, s)
+        r = _add_scaled(s, -omega, w)
         after = inner(r, r)
         looked = (going & (after <= goal) & (looks > 0)).astype(jnp.int32)
-        r, after = _looked_at(looked, matvec, b, x, r, after, inner)
+        r, after = _recompute_residual(looked, matvec, b, x, r, after, inner)
         shadow = inner(b, r)
-        beta = _ratio(shadow * alpha, rho * omega, going & (looked == 0))
-        p = _plus(r, beta, _plus(p, -omega, v))
+        beta = _safe_ratio(shadow * alpha, rho * omega, going & (looked == 0))
+        p = _add_scaled(r, beta, _add_scaled(p, -omega, v))
         count, square = count + 2 * going.astype(jnp.int32) + looked, jnp.where(going, after, square)
         going = going & (after > goal) & (shadow != 0) & (omega != 0)
         return x, r, p, jnp.where(going, shadow, rho), square, going, count, looks - looked, i + 2
 
     none = jnp.zeros(size.shape, jnp.int32)
     zero = [jnp.zeros_like(e) for e in b]
-    start = (zero, b, b, size, size, size > goal, none, none + LOOKS, jnp.zeros((), jnp.int32))
+    start = (zero, b, b, size, size, size > goal, none, none + MAX_RESIDUAL_CHECKS, jnp.zeros((), jnp.int32))
     x, _, _, _, square, _, count, _, _ = lax.while_loop(lambda c: any_lane(c[5]) & (c[-1] < most), body, start)
-    return x, solved(square, size, goal, count)
+    return x, build_report(square, size, goal, count)
 
 
-def _looked_at(
+def _recompute_residual(
     looked: Array, matvec: Callable, b: Vector, x: Vector, r: Vector, square: Array, inner: Callable
 ) -> tuple[Vector, Array]:
     """The residual b - A x itself, and its square, for the systems that believe they are done: what is carried along drifts."""
@@ -106,19 +106,19 @@ def _looked_at(
     return lax.cond(any_lane(looked > 0), true, lambda: (r, square))
 
 
-def _plus(x: Vector, number: Array, y: Vector) -> Vector:
+def _add_scaled(x: Vector, number: Array, y: Vector) -> Vector:
     """x + number·y, the number one for each system."""
     return [a + scale(number, b) for a, b in zip(x, y, strict=True)]
 
 
-def _ratio(above: Array, below: Array, going: Array) -> Array:
+def _safe_ratio(above: Array, below: Array, going: Array) -> Array:
     """A quotient for the systems that go on, zero for the others and where it is none."""
     good = going & (below != 0)
     return jnp.where(good, above, 0.0) / jnp.where(good, below, 1.0)
 
 
-def solved(square: Array, size: Array, goal: Array, count: Array) -> Solved:
+def build_report(square: Array, size: Array, goal: Array, count: Array) -> SolveReport:
     """The report on a solve whose residual has the square `square`, of a right-hand side with the square `size`."""
     present = size > 0
     residual = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))
-    return Solved(residual, count, square <= goal)
+    return SolveReport(residual, count, square <= goal)

@@ -18,7 +18,7 @@ from physjax.stepping.registry import METHODS, Promises, promises
 from physjax.vectors import scale
 
 
-@promises(order=1, evaluations=1, stable_to=0.0)
+@promises(order=1, evaluations=1, stability_limit=0.0)
 def euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     """Explicit Euler: follow the slope at the start. One force a step; gains energy at any step without damping.
 
@@ -29,10 +29,10 @@ def euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         >>> print(fall.position, fall.velocity)
         [ 3. 14.] [ 3.  -5.8]
     """
-    return _along(state, system.rate(t, state), dt)
+    return _move_along(state, system.rate(t, state), dt)
 
 
-@promises(order=1, evaluations=1, stable_to=2.0)
+@promises(order=1, evaluations=1, stability_limit=2.0)
 def semi_implicit_euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     """Kick, then drift with the new velocity: one force a step, energy bounded.
 
@@ -47,7 +47,7 @@ def semi_implicit_euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     return system.drift(system.kick(state, system.rate(t, state), dt), dt)
 
 
-@promises(order=2, evaluations=2, stable_to=0.0)
+@promises(order=2, evaluations=2, stability_limit=0.0)
 def midpoint(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     """Follow the slope found half a step ahead: second order; an oscillation grows by √(1 + (ωdt)⁴/4) a step.
 
@@ -56,11 +56,11 @@ def midpoint(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         >>> print(fall.position, fall.velocity)
         [3.  9.1] [ 3.  -5.8]
     """
-    half = _along(state, system.rate(t, state), dt / 2)
-    return _along(state, system.rate(t + dt / 2, half), dt)
+    half = _move_along(state, system.rate(t, state), dt / 2)
+    return _move_along(state, system.rate(t + dt / 2, half), dt)
 
 
-@promises(order=2, evaluations=2, stable_to=2.0)
+@promises(order=2, evaluations=2, stability_limit=2.0)
 def verlet(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     """Velocity Verlet: half a kick, drift, half a kick with the force found there. Second order, energy bounded.
 
@@ -77,7 +77,7 @@ def verlet(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     return system.kick(arrived, end, dt / 2)
 
 
-@promises(order=2, evaluations=1, stable_to=2.0, order_with_drag=1)
+@promises(order=2, evaluations=1, stability_limit=2.0, order_with_drag=1)
 def leapfrog(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     """Drift half way, kick, drift on: second order for one force a step, the cheapest where forces depend on position alone.
 
@@ -92,7 +92,7 @@ def leapfrog(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     return system.drift(system.kick(half, system.rate(t + dt / 2, half), dt), dt / 2)
 
 
-@promises(order=4, evaluations=4, stable_to=2 * math.sqrt(2))
+@promises(order=4, evaluations=4, stability_limit=2 * math.sqrt(2))
 def rk4(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
     """The classical Runge-Kutta method: four slopes, weighted 1 2 2 1. Loses energy near its limit.
 
@@ -104,11 +104,11 @@ def rk4(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
         (0.9801, 0.9801)
     """
     k1 = system.rate(t, state)
-    k2 = system.rate(t + dt / 2, _along(state, k1, dt / 2))
-    k3 = system.rate(t + dt / 2, _along(state, k2, dt / 2))
-    k4 = system.rate(t + dt, _along(state, k3, dt))
+    k2 = system.rate(t + dt / 2, _move_along(state, k1, dt / 2))
+    k3 = system.rate(t + dt / 2, _move_along(state, k2, dt / 2))
+    k4 = system.rate(t + dt, _move_along(state, k3, dt))
     slope = jax.tree.map(lambda a, b, c, d: a + 2.0 * b + 2.0 * c + d, k1, k2, k3, k4)
-    return _along(state, slope, dt / 6)
+    return _move_along(state, slope, dt / 6)
 
 
 implicit_euler = ImplicitEuler()
@@ -132,7 +132,7 @@ __all__ = [
 ]
 
 
-def _along(state: Any, slope: Any, dt: ArrayLike) -> Any:
+def _move_along(state: Any, slope: Any, dt: ArrayLike) -> Any:
     """The state moved along a slope: y + dt·k."""
     return jax.tree.map(lambda y, k: y + scale(dt, k), state, slope)
 

@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.checks import real_quantity
+from physjax.checks import as_real_quantity
 from physjax.scene import Scene
 from physjax.trajectory import Trajectory
 
@@ -78,8 +78,8 @@ def reference(
     times = np.asarray(times, float)
     if times.ndim != 1 or not times.size or not np.isfinite(times).all() or times[0] < 0 or (np.diff(times) <= 0).any():
         raise ValueError("reference: times must be a list of ascending finite numbers >= 0 [s].")
-    real_quantity("rtol", rtol, above=0.0)
-    real_quantity("atol", atol, above=0.0)
+    as_real_quantity("rtol", rtol, above=0.0)
+    as_real_quantity("atol", atol, above=0.0)
     if scene.emitter is not None or any(hasattr(force, "advance") for force in scene.forces):
         raise ValueError(
             "reference: the scene has parts that remember, which an ordinary differential equation has not. Remove them."
@@ -89,10 +89,10 @@ def reference(
             "reference: the scene has contacts, which an ordinary differential equation has not. Remove them."
         )
     with jax.enable_x64(True):
-        scene = in_dtype(scene, jnp.float64)
+        scene = cast_floats(scene, jnp.float64)
         end = jnp.asarray(max(times[-1], 1e-300))
         states, success, _ = solve_ode(
-            scene, jnp.asarray(times), end, jnp.asarray(rtol), jnp.asarray(atol), solver or default_solver(), True
+            scene, jnp.asarray(times), end, jnp.asarray(rtol), jnp.asarray(atol), solver or build_default_solver(), True
         )
         ok = scene.finite(jax.tree.map(lambda leaf: leaf[-1], states)) & success
         states, ok = jax.tree.map(np.asarray, (states, ok))
@@ -112,14 +112,14 @@ def reference(
     )
 
 
-def default_solver() -> Any:
+def build_default_solver() -> Any:
     """Dopri8: order 8, the cheapest way to ten digits."""
     import diffrax
 
     return diffrax.Dopri8()
 
 
-def in_dtype(tree: Any, dtype: Any) -> Any:
+def cast_floats(tree: Any, dtype: Any) -> Any:
     """A scene (or state) with all its floating-point arrays in another dtype; for float64 inside `jax.enable_x64(True)`."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, tree)
 
@@ -135,7 +135,7 @@ def solve_ode(
     """
     import diffrax
 
-    norm = {"norm": _largest} if strict else {}
+    norm = {"norm": _max_norm} if strict else {}
     controller = diffrax.PIDController(rtol=rtol, atol=atol, **norm)
     jumps = discontinuities(scene)
     if jumps.size or strict:
@@ -155,12 +155,12 @@ def solve_ode(
         max_steps=MAX_STEPS if strict else MAX_STEPS // 10,
         throw=False,
     )
-    states = jax.vmap(scene.settled)(solution.ys)
-    if scene.led is not None:
-        states = jax.vmap(scene.led.lead)(times, states)
+    states = jax.vmap(scene.normalised)(solution.ys)
+    if scene.prescribed_motion is not None:
+        states = jax.vmap(scene.prescribed_motion.prescribe)(times, states)
     return states, solution.result == diffrax.RESULTS.successful, solution.stats
 
 
-def _largest(state: Any) -> Array:
+def _max_norm(state: Any) -> Array:
     """The largest component of a state: no lane may hide behind the others' average."""
     return jax.tree.reduce(jnp.maximum, jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf)), state))

@@ -10,34 +10,36 @@ METHODS: dict[str, Callable] = {}
 class Promises(NamedTuple):
     """What a method promises, each measured by the tests.
 
-    `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stable_to`: the largest
+    `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stability_limit`: the largest
     stable ω·dt on the undamped oscillator. `order_with_drag`: the order once forces depend on velocity, where it
     differs.
 
     Example:
         >>> methods.verlet.promises
-        Promises(order=2, evaluations=2, stable_to=2.0, order_with_drag=2)
+        Promises(order=2, evaluations=2, stability_limit=2.0, order_with_drag=2)
     """
 
     order: int
     evaluations: int
-    stable_to: float
+    stability_limit: float
     order_with_drag: int
 
 
 def promises(
-    *, order: int, evaluations: int, stable_to: float, order_with_drag: int | None = None
+    *, order: int, evaluations: int, stability_limit: float, order_with_drag: int | None = None
 ) -> Callable[[Callable], Callable]:
     """Attach promises to a method (`method.promises`) and enter it in `METHODS`.
 
     Example:
-        >>> enter = methods.promises(order=1, evaluations=1, stable_to=0.0)
+        >>> enter = methods.promises(order=1, evaluations=1, stability_limit=0.0)
         >>> enter(methods.euler) is methods.METHODS["euler"]
         True
     """
 
     def attach(method: Callable) -> Callable:
-        method.promises = Promises(order, evaluations, stable_to, order if order_with_drag is None else order_with_drag)
+        method.promises = Promises(
+            order, evaluations, stability_limit, order if order_with_drag is None else order_with_drag
+        )
         METHODS[method.__name__] = method
         return method
 

@@ -18,14 +18,14 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.backend import FEWEST, in_pieces
-from physjax.checks import concrete, positive_integer, real_quantity
-from physjax.closures import warn_of_remade
-from physjax.loops import LAST_STEP, moment_at, repeat, time_at
-from physjax.parts import as_module, changes, plain_functions
+from physjax.backend import MIN_LANES_TO_SELECT, split_compilation
+from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
+from physjax.closures import warn_of_recompilation
+from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
+from physjax.parts import as_module, build_memory_mask, find_plain_functions
 from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
-from physjax.trajectory import Trajectory, memories
+from physjax.trajectory import Trajectory, select_stateful_parts
 
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
@@ -67,39 +67,39 @@ def simulate(
         raise TypeError(f"record: got {record!r}, expected a function (t, state) -> what to keep.")
     if not jnp.issubdtype(jnp.result_type(first_step), jnp.integer):
         raise TypeError(f"first_step: got {first_step!r}, expected an integer, e.g. flight.final_step.")
-    steps = _checked_steps(steps, duration, dt)
-    dt = _checked_dt(dt, scene)
-    save_every = positive_integer("save_every", save_every)
+    steps = _check_steps(steps, duration, dt)
+    dt = _check_dt(dt, scene)
+    save_every = as_positive_integer("save_every", save_every)
     if steps % save_every:
         raise ValueError(f"save_every: got {save_every}, expected a divisor of the {steps} steps. Change either.")
     method = as_module(method)
-    warn_of_remade("simulate", (*(plain.function for plain in plain_functions((scene, method))), record))
-    first_step, dt = _checked_count(first_step, steps, dt)
+    warn_of_recompilation("simulate", (*(plain.function for plain in find_plain_functions((scene, method))), record))
+    first_step, dt = _check_first_step(first_step, steps, dt)
     rollout = _rollout
-    if record is None and _stands_alone((scene, method, dt, first_step)):
-        rollout = _rollout_of_few if _is_mostly_compiled(scene) else _rollout_alone
+    if record is None and _is_untransformed((scene, method, dt, first_step)):
+        rollout = _rollout_few_lanes if _is_compile_bound(scene) else _rollout_untransformed
     return rollout(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
-def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
+def _run_steps(scene, method, dt, first_step, frames, save_every, record):
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
-    changing = changing_parts(scene, dt)
+    changing = find_changing_parts(scene, dt)
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
     def step(i, moving, still, dt):
-        return eqx.filter(_step(eqx.combine(moving, still), method, i, dt), changing)
+        return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
 
     blocks = Blocks.of(scene, moving, frame_steps=save_every) if record is None else None
 
     def frame(moving, index):
         first = first_step + index * save_every
         if blocks is None:
-            moving = repeat(partial(step, still=still, dt=dt), moving, first, save_every)
+            moving = repeat_steps(partial(step, still=still, dt=dt), moving, first, save_every)
         else:
             moving = blocks.map(
-                lambda m, s, h: repeat(partial(step, still=s, dt=h), m, first, save_every),
-                moving, still, dt, masks=scene.lane_mask((still, dt)),
+                lambda m, s, h: repeat_steps(partial(step, still=s, dt=h), m, first, save_every),
+                moving, still, dt, masks=scene.build_lane_mask((still, dt)),
             )  # fmt: skip
         return moving, moving if record is None else record(clock(first + save_every), eqx.combine(moving, still).state)
 
@@ -114,7 +114,7 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     return Trajectory(
         time=jax.vmap(clock)(first_step + save_every * jnp.arange(frames + 1, dtype=jnp.int32)),
         state=None if film is None else film.state,
-        parts=() if film is None else memories(film),
+        parts=() if film is None else select_stateful_parts(film),
         recorded=None if record is None else kept,
         ok=scene.finite(final_scene.state),
         scene=scene,
@@ -127,59 +127,65 @@ def _compiled_run(scene, method, dt, first_step, frames, save_every, record):
     )
 
 
-_rollout = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"))
+_rollout = jax.jit(_run_steps, static_argnames=("frames", "save_every", "record"))
 # XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster; JAX lets us
 # ask only where no other transformation is around the run
-WIDE = {"xla_cpu_prefer_vector_width": 512}
-_rollout_alone = jax.jit(_compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=WIDE)
+WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
+_rollout_untransformed = jax.jit(
+    _run_steps, static_argnames=("frames", "save_every", "record"), compiler_options=WIDE_VECTOR_OPTIONS
+)
 # timed contacts are many small computations, over which the emitters of jax 0.10 take twice the time of the older ones
-_OLDER = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
-_rollout_of_few = jax.jit(
-    _compiled_run, static_argnames=("frames", "save_every", "record"), compiler_options=WIDE | _OLDER
+_OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+_rollout_few_lanes = jax.jit(
+    _run_steps,
+    static_argnames=("frames", "save_every", "record"),
+    compiler_options=WIDE_VECTOR_OPTIONS | _OLDER_EMITTER_OPTIONS,
 )
 
 
-def _is_mostly_compiled(scene: Scene) -> bool:
+def _is_compile_bound(scene: Scene) -> bool:
     """Whether compiling is what a run costs: few lanes, and contacts that remember."""
-    return math.prod(scene.state.lanes) < FEWEST and any(contact.memory for contact in scene.contacts)
+    return math.prod(scene.state.lanes) < MIN_LANES_TO_SELECT and any(contact.memory for contact in scene.contacts)
 
 
-def _stands_alone(run: tuple) -> bool:
+def _is_untransformed(run: tuple) -> bool:
     """Whether a run on a CPU is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
     scene, method, *_ = run
-    path = () if scene.led is None else (scene.led.path,)
+    path = () if scene.prescribed_motion is None else (scene.prescribed_motion.path,)
     source = () if scene.emitter is None else (scene.emitter.source,)
     parts = (*scene.forces, *scene.contacts, *path, *source, method)
-    ours = all(map(_is_ours, (*map(type, parts), *(plain.function for plain in plain_functions(parts)))))
+    ours = all(
+        map(_is_library_definition, (*map(type, parts), *(plain.function for plain in find_plain_functions(parts))))
+    )
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
     return ours and not traced and jax.default_backend() == "cpu"
 
 
-def _is_ours(definition: Any) -> bool:
+def _is_library_definition(definition: Any) -> bool:
     """Whether a function or class is the library's own, which closes over nothing."""
     return getattr(definition, "__module__", "").startswith("physjax.") and "<locals>" not in definition.__qualname__
 
 
-def _step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
+def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
     """Step number i of a loop."""
-    if scene.in_pieces and jax.default_backend() == "cpu":
-        scene = scene.having(state=jax.tree.map(lambda leaf: in_pieces(leaf, i), scene.state))
+    if scene.compiles_in_pieces and jax.default_backend() == "cpu":
+        scene = scene.replace(state=jax.tree.map(lambda leaf: split_compilation(leaf, i), scene.state))
     return scene.step(method, moment_at(i, dt, scene.state.dtype), dt)
 
 
 @partial(jax.jit, static_argnames=("frames",))
-def sample(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: ArrayLike, frames: int) -> Any:
+def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: ArrayLike, frames: int) -> Any:
     """States at `frames` + 1 equally spaced times, with a number of steps between them that is data, not shape.
 
     One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
-    changing = changing_parts(scene, dt)
+    changing = find_changing_parts(scene, dt)
     moving, still = eqx.partition(scene, changing)
 
     def step(i, moving):
         i = jnp.asarray(i, jnp.int32)  # a plain number where jit is disabled
-        return eqx.filter(_step(eqx.combine(moving, still), method, i, dt), changing)
+        return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
 
     def frame(moving, index):
         moving = lax.fori_loop(index * steps_per_frame, (index + 1) * steps_per_frame, step, moving)
@@ -210,20 +216,20 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
         >>> int(end.steps), round(float(end.dt), 4)
         (3, 0.3333)
     """
-    duration = _forward(real_quantity("duration [s]", duration, above=0.0).astype(scene.state.dtype))
-    dt = _forward(real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
+    duration = _invalidate_nonpositive(as_real_quantity("duration [s]", duration, above=0.0).astype(scene.state.dtype))
+    dt = _invalidate_nonpositive(as_real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
     if duration.shape or dt.shape:
         raise ValueError(f"state_after: got shapes {duration.shape} and {dt.shape}, expected one duration and one dt.")
     steps = jnp.maximum(1, jnp.round(duration / dt)).astype(jnp.int32)
     dt = duration / steps.astype(dt.dtype)
     method = as_module(method)
-    warn_of_remade("state_after", [plain.function for plain in plain_functions((scene, method))])
-    states = sample(scene, method, dt, steps, 1)
+    warn_of_recompilation("state_after", [plain.function for plain in find_plain_functions((scene, method))])
+    states = sample_states(scene, method, dt, steps, 1)
     end = jax.tree.map(lambda leaf: leaf[-1], states)
     return StateAfter(end, steps, dt, scene.finite(end))
 
 
-def changing_parts(scene: Scene, dt: ArrayLike) -> Any:
+def find_changing_parts(scene: Scene, dt: ArrayLike) -> Any:
     """Mask over the scene's arrays: the state, what contacts remember, and what `advance` replaces in a force.
 
     The last is found by tracing it and comparing identities.
@@ -231,19 +237,19 @@ def changing_parts(scene: Scene, dt: ArrayLike) -> Any:
     mask = []
 
     def trace(scene):
-        after = scene.advanced(jnp.zeros((), scene.state.dtype), dt)
+        after = scene.advance_memory(jnp.zeros((), scene.state.dtype), dt)
         mask.append(jax.tree.map(lambda before, now: before is not now, scene, after))
         return after
 
     jax.eval_shape(trace, scene)
-    contacts = tuple(map(changes, scene.contacts))
-    state, emitter = jax.tree.map(lambda _: True, scene.state), changes(scene.emitter)
-    return mask[0].having(state=state, contacts=contacts, emitter=emitter)
+    contacts = tuple(map(build_memory_mask, scene.contacts))
+    state, emitter = jax.tree.map(lambda _: True, scene.state), build_memory_mask(scene.emitter)
+    return mask[0].replace(state=state, contacts=contacts, emitter=emitter)
 
 
-def _checked_count(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Array, Array]:
+def _check_first_step(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Array, Array]:
     """The first step in 32 bits; the last must fit as well, or time would run backwards: a traced one makes dt NaN."""
-    number = concrete(first_step)
+    number = concrete_or_none(first_step)
     if number is not None and number.size and number.max() > LAST_STEP - steps:
         raise ValueError(
             f"first_step: got {number.max()} and {steps} steps, expected at most {LAST_STEP} together: steps are counted in "
@@ -253,8 +259,8 @@ def _checked_count(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Array,
     return jnp.asarray(first_step, jnp.int32), dt if fits is True else jnp.where(fits, dt, jnp.nan)
 
 
-def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:
-    dt = _forward(real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
+def _check_dt(dt: ArrayLike, scene: Scene) -> Array:
+    dt = _invalidate_nonpositive(as_real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
     if dt.shape not in ((), scene.status_shape):
         raise ValueError(
             f"dt [s]: got shape {dt.shape}, expected () or {scene.status_shape}: one step size per "
@@ -263,25 +269,25 @@ def _checked_dt(dt: ArrayLike, scene: Scene) -> Array:
     return dt
 
 
-def _forward(duration: Array) -> Array:
+def _invalidate_nonpositive(duration: Array) -> Array:
     """A duration [s], NaN where it is traced and not > 0: then the run's status says so."""
     return jnp.where(duration > 0, duration, jnp.nan) if isinstance(duration, jax.core.Tracer) else duration
 
 
-def _checked_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> int:
+def _check_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> int:
     """The number of steps, given or counted from the duration; a duration that is no multiple of dt is an error."""
     if (steps is None) == (duration is None):
         given = "neither" if steps is None else "both"
         raise ValueError(f"simulate: got {given} of steps and duration, expected exactly one of them.")
     if steps is not None:
-        return positive_integer("steps", steps)
+        return as_positive_integer("steps", steps)
     if isinstance(dt, jax.core.Tracer) or isinstance(duration, jax.core.Tracer):
         raise TypeError(
             "duration: dt or duration is being traced, so the number of steps is unknown. Give steps= instead."
         )
     with jax.ensure_compile_time_eval():  # a number stays a number inside jit
-        real_quantity("dt [s]", dt, above=0.0)
-        span = real_quantity("duration [s]", duration, above=0.0)
+        as_real_quantity("dt [s]", dt, above=0.0)
+        span = as_real_quantity("duration [s]", duration, above=0.0)
     if span.ndim:
         raise ValueError(f"duration [s]: got shape {span.shape}, expected one number.")
     # before rounding to the state's dtype: a Python 0.01 divides 5 s, the float32 next to it does not

@@ -10,15 +10,15 @@ import numpy as np
 from physjax.particles import Particles
 from physjax.scene import Scene
 from physjax.stepping import methods
-from physjax.stepping.reference import in_dtype, reference
+from physjax.stepping.reference import cast_floats, reference
 from physjax.stepping.simulate import simulate
 from physjax.study.energy.quantities import Conserved
 from physjax.trajectory import Trajectory
 
-FINE = 64
+REFERENCE_STEPS_PER_FRAME = 64
 """Steps of rk4 between two moments at which errors are measured, where diffrax cannot be the reference."""
 
-FILM = 512
+FILM_FRAMES = 512
 """A run is drawn from at least so many moments."""
 
 
@@ -65,20 +65,22 @@ class Problem(NamedTuple):
         """The scene at `times`, in float64, as true as it can be had: NumPy arrays.
 
         By diffrax at 1e-12. A scene that is no ordinary differential equation, with contacts or with springs that
-        break, is stepped by our own rk4 with `FINE` steps from each of the times to the next, touches answered as the
+        break, is stepped by our own rk4 with `REFERENCE_STEPS_PER_FRAME` steps from each of the times to the next, touches answered as the
         scene says. `parts` and `final_scene` then tell what is remembered.
         """
         if self.is_ode:
             return reference(self.scene, self.times, rtol=1e-12, atol=1e-12)
         with jax.enable_x64(True):
-            scene = in_dtype(self.scene, jnp.float64)
-            steps = FINE * self.frames
-            flight = simulate(scene, methods.rk4, dt=self.duration / steps, steps=steps, save_every=FINE)
+            scene = cast_floats(self.scene, jnp.float64)
+            steps = REFERENCE_STEPS_PER_FRAME * self.frames
+            flight = simulate(
+                scene, methods.rk4, dt=self.duration / steps, steps=steps, save_every=REFERENCE_STEPS_PER_FRAME
+            )
             return jax.tree.map(np.asarray, flight)
 
     def filmed(self) -> Trajectory:
         """The reference at moments enough for a picture without corners, and a film."""
-        return self._replace(frames=max(self.frames, FILM)).reference()
+        return self._replace(frames=max(self.frames, FILM_FRAMES)).reference()
 
     def verify(self) -> list[tuple[Truth, np.ndarray, bool]]:
         """Every truth with the measured value and whether it holds."""

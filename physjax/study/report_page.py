@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from datetime import date
 from typing import Any, NamedTuple
 
-from physjax.text import machine
+from physjax.text import describe_machine
 
-PHONE, READABLE = 6.5, 65
+PHONE_WIDTH_INCHES, READABLE_PIXELS_PER_INCH = 6.5, 65
 """Width [inch] of a figure that still fits a phone; pixels an inch at which the letters of a wider one can be read."""
 
 
@@ -35,7 +35,7 @@ class Section:
         self.heading, self.blocks = heading, blocks
 
 
-def drawn(figure: Any, alt: str) -> Picture:
+def encode_figure(figure: Any, alt: str) -> Picture:
     """A matplotlib figure as a picture, and closed; on a phone a wide one scrolls, so that it can be read."""
     from matplotlib import pyplot as plt
 
@@ -43,20 +43,26 @@ def drawn(figure: Any, alt: str) -> Picture:
     figure.savefig(file, dpi=110)
     plt.close(figure)
     inches = figure.get_figwidth()
-    return Picture(file.getvalue(), alt, round(READABLE * inches) if inches > PHONE else 0)
+    return Picture(file.getvalue(), alt, round(READABLE_PIXELS_PER_INCH * inches) if inches > PHONE_WIDTH_INCHES else 0)
 
 
-def page(title: str, summary: str, sections: Sequence[Section]) -> str:
+def build_page(title: str, summary: str, sections: Sequence[Section]) -> str:
     """A self-contained HTML page, pictures inside, readable on a phone."""
-    parts = [f"<h1>{html.escape(title)}</h1>", _block(Table(summary)) if summary else "", _contents(sections)]
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        _render_block(Table(summary)) if summary else "",
+        _render_contents(sections),
+    ]
     for section in sections:
-        blocks = "\n".join(map(_block, section.blocks))
-        parts.append(f'<section id="{_anchor(section)}"><h2>{html.escape(section.heading)}</h2>\n{blocks}\n</section>')
-    parts.append(f"<footer>Measured {date.today():%Y-%m-%d} on {html.escape(machine())}.</footer>")
+        blocks = "\n".join(map(_render_block, section.blocks))
+        parts.append(
+            f'<section id="{_make_anchor(section)}"><h2>{html.escape(section.heading)}</h2>\n{blocks}\n</section>'
+        )
+    parts.append(f"<footer>Measured {date.today():%Y-%m-%d} on {html.escape(describe_machine())}.</footer>")
     return _PAGE.format(title=html.escape(title), body="\n".join(parts))
 
 
-def _block(block: str | Picture | Table) -> str:
+def _render_block(block: str | Picture | Table) -> str:
     if isinstance(block, Picture):
         source = f"data:image/{block.kind};base64,{base64.b64encode(block.data).decode()}"
         style = f' style="min-width: {block.width}px"' if block.width else ""
@@ -65,12 +71,12 @@ def _block(block: str | Picture | Table) -> str:
     return f"<{tag}>{html.escape(text)}</{tag}>"
 
 
-def _anchor(section: Section) -> str:
+def _make_anchor(section: Section) -> str:
     return html.escape(section.heading.replace(" ", "-"))
 
 
-def _contents(sections: Sequence[Section]) -> str:
-    links = (f'<a href="#{_anchor(section)}">{html.escape(section.heading)}</a>' for section in sections)
+def _render_contents(sections: Sequence[Section]) -> str:
+    links = (f'<a href="#{_make_anchor(section)}">{html.escape(section.heading)}</a>' for section in sections)
     return f"<nav>{' · '.join(links)}</nav>"
 
 

@@ -13,22 +13,22 @@ from physjax.show import auto_plot
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
-from physjax.study.accuracy.result import ERRORS, Run, WorkPrecision
-from physjax.study.energy.audit import LEGS
+from physjax.study.accuracy.result import TABLE_ERRORS, Run, WorkPrecision
+from physjax.study.energy.audit import RESPONSE_OBSERVERS
 from physjax.study.problem import Problem
-from physjax.study.report_page import Picture, Section, Table, drawn
-from physjax.study.stability.survey import fastest_moment, map_around
-from physjax.text import seconds_text
+from physjax.study.report_page import Picture, Section, Table, encode_figure
+from physjax.study.stability.survey import find_fastest_moment, map_around_limits
+from physjax.text import format_seconds
 
-WANTED = 1e-4
+TARGET_ERROR = 1e-4
 """Error, relative to the extent of the path, of the run whose books are closed and whose parts are left out."""
-TIMING = 3.0
+ABLATION_TIMING_SECONDS = 3.0
 """Time for the timings of the ablation [s]."""
 
 Block = str | Picture | Table
 
 
-class Studied(NamedTuple):
+class SceneStudy(NamedTuple):
     """A scene under a name, what it is in one sentence, and its work-precision study, which the parts draw upon."""
 
     name: str
@@ -42,9 +42,9 @@ class Studied(NamedTuple):
 
         Of methods that follow an undamped swing as well: the ablation takes the damping away.
         """
-        steady = {name for name, method in METHODS.items() if method.promises.stable_to > 0}
+        steady = {name for name, method in METHODS.items() if method.promises.stability_limit > 0}
         ours = [run for run in self.precision.runs if run.method in steady and run.status == "ok"]
-        true = [run for run in ours if run.path_error <= WANTED]
+        true = [run for run in ours if run.path_error <= TARGET_ERROR]
         return (
             min(true, key=lambda run: run.seconds) if true else min(ours, key=lambda run: run.path_error, default=None)
         )
@@ -57,13 +57,13 @@ class Studied(NamedTuple):
         return {"method": method, "dt": problem.duration / steps, "duration": problem.duration, "save_every": every}
 
     @property
-    def stepped(self) -> str:
+    def stepping_text(self) -> str:
         """That run in words."""
         run = self.run
-        return f"Stepped by {run.method} with dt = {seconds_text(run.dt)}, whose error is {run.path_error:.1e} of the path."
+        return f"Stepped by {run.method} with dt = {format_seconds(run.dt)}, whose error is {run.path_error:.1e} of the path."
 
 
-def sections(
+def build_sections(
     problem: Problem,
     name: str,
     sentence: str,
@@ -77,7 +77,7 @@ def sections(
     """
     progress("reference and runs")
     precision = accuracy.work_precision(problem, budget=budget, name=name)
-    studied = Studied(name, sentence, problem, precision)
+    studied = SceneStudy(name, sentence, problem, precision)
     for heading, part in PARTS.items():
         progress(heading)
         with jax.enable_x64(True):
@@ -85,24 +85,26 @@ def sections(
         yield section
 
 
-def _seen(studied: Studied) -> Iterator[Block]:
+def _show_scene(studied: SceneStudy) -> Iterator[Block]:
     yield studied.sentence
     run, looks = studied.problem.filmed(), studied.problem.looks
-    yield drawn(auto_plot.still(run, looks), f"Picture: {studied.sentence}")
-    yield Picture(auto_plot.moving(run, looks).gif(), f"Film: {studied.sentence}", kind="gif")
+    yield encode_figure(auto_plot.plot_run(run, looks), f"Picture: {studied.sentence}")
+    yield Picture(auto_plot.animate_run(run, looks).gif(), f"Film: {studied.sentence}", kind="gif")
 
 
-def _charted(studied: Studied) -> Iterator[Block]:
+def _chart_precision(studied: SceneStudy) -> Iterator[Block]:
     precision = studied.precision
     yield (
         "Every method from coarse to fine steps. Errors are relative to the extent of the path, measured against: "
         f"{precision.truth}. The table has the shortest run time for each error."
     )
-    yield drawn(precision.plot(), f"Charts of error against run time and step for each method in {studied.name}.")
+    yield encode_figure(
+        precision.plot(), f"Charts of error against run time and step for each method in {studied.name}."
+    )
     yield Table(precision.table())
 
 
-def _stable(studied: Studied) -> Iterator[Block]:
+def _chart_stability(studied: SceneStudy) -> Iterator[Block]:
     scene = studied.problem.scene
     if not isinstance(scene.state, Particles):
         yield "No map: the limits are those of small motions in a straight line, and rigid bodies turn."
@@ -110,14 +112,16 @@ def _stable(studied: Studied) -> Iterator[Block]:
     if scene.emitter is not None:
         yield "No map: particles are born and die, so there is no one motion that could be stable."
         return
-    time, at = fastest_moment(studied.problem)
+    time, at = find_fastest_moment(studied.problem)
     limits = [stability.limit(scene, method, at) for method in METHODS.values()]
     yield f"The longest stable step about t = {time:.3g} s, where the scene is fastest:"
     yield from map(str, limits)
     if stability.grows_by_itself(scene, at).any():
         yield "Neighbours part there by the scene's own motion, whatever the method."
     timed = any(contact.response is impact for contact in scene.contacts)
-    chart = map_around(Scene(scene.state, scene.mass, scene.forces, pinned=scene.pinned) if timed else scene, limits)
+    chart = map_around_limits(
+        Scene(scene.state, scene.mass, scene.forces, pinned=scene.pinned) if timed else scene, limits
+    )
     if chart is None:
         yield "No map: no method has a limit here."
         return
@@ -125,29 +129,29 @@ def _stable(studied: Studied) -> Iterator[Block]:
         f"Runs from the start{', without their touches' if timed else ''}, judged by their error; the black line is the "
         "limit predicted at their start."
     )
-    yield drawn(
+    yield encode_figure(
         chart.plot(), f"Map of the steps at which each method is stable, inaccurate or diverged in {studied.name}."
     )
 
 
-def _ledger(studied: Studied) -> Iterator[Block]:
+def _chart_ledger(studied: SceneStudy) -> Iterator[Block]:
     scene = studied.problem.scene
     if scene.emitter is not None:
         yield "No ledger: particles bring energy when they are born and take it when they die."
         return
-    if any((contact.response or project) not in (*LEGS, project) for contact in scene.contacts):
+    if any((contact.response or project) not in (*RESPONSE_OBSERVERS, project) for contact in scene.contacts):
         yield "No ledger: a contact has a response of its own, and what it does to a touch is not known."
         return
     if studied.run is None:
         yield NO_RUN
         return
-    books = energy.ledger(simulate(scene, **studied.stepping))
-    yield studied.stepped
-    yield drawn(books.plot(), f"Chart of where the energy of {studied.name} went over time.")
-    yield Table(str(books))
+    ledger = energy.ledger(simulate(scene, **studied.stepping))
+    yield studied.stepping_text
+    yield encode_figure(ledger.plot(), f"Chart of where the energy of {studied.name} went over time.")
+    yield Table(str(ledger))
 
 
-def _ablated(studied: Studied) -> Iterator[Block]:
+def _chart_ablation(studied: SceneStudy) -> Iterator[Block]:
     scene = studied.problem.scene
     if scene.emitter is not None:
         yield "No ablation: without one of its parts other particles would be born, and there would be no two ends to compare."
@@ -163,20 +167,20 @@ def _ablated(studied: Studied) -> Iterator[Block]:
         scene,
         lambda flight: flight.position[-1],
         scale=extent,
-        seconds=TIMING,
+        seconds=ABLATION_TIMING_SECONDS,
         **studied.stepping,
     )
     yield (
         f"What each part is worth for where everything ends: what counts is a thousandth of the extent of the path, "
-        f"{extent:.3g} m. {studied.stepped}"
+        f"{extent:.3g} m. {studied.stepping_text}"
     )
-    yield drawn(found.plot(), f"Chart of how much each part of {studied.name} changes where it ends.")
+    yield encode_figure(found.plot(), f"Chart of how much each part of {studied.name} changes where it ends.")
     yield Table(str(found))
 
 
-def _recommended(studied: Studied) -> Iterator[Block]:
+def _write_recommendation(studied: SceneStudy) -> Iterator[Block]:
     problem = studied.problem
-    answers = accuracy.recommend(problem.scene, error=ERRORS, horizon=problem.duration, progress=False)
+    answers = accuracy.recommend(problem.scene, error=TABLE_ERRORS, horizon=problem.duration, progress=False)
     for answer in answers:
         yield f"For an error of {answer.error:g}: {answer.reason}"
     yield Table("\n\n".join(map(str, answers)))
@@ -184,11 +188,11 @@ def _recommended(studied: Studied) -> Iterator[Block]:
 
 NO_RUN = "Not to be had: no run with a fixed step stayed on the path."
 PARTS = {
-    "scene": _seen,
-    "speed against accuracy": _charted,
-    "stability": _stable,
-    "energy ledger": _ledger,
-    "ablation": _ablated,
-    "recommendation": _recommended,
+    "scene": _show_scene,
+    "speed against accuracy": _chart_precision,
+    "stability": _chart_stability,
+    "energy ledger": _chart_ledger,
+    "ablation": _chart_ablation,
+    "recommendation": _write_recommendation,
 }
 """The parts of a page by their headings, in the order of reading."""

@@ -7,7 +7,7 @@ from PIL import Image
 from physjax import Particles, Scene, forces, lattices
 from physjax.cli import main
 from physjax.scenes import SCENES
-from physjax.scenes.catalogue import entry
+from physjax.scenes.catalogue import describe_scene
 from physjax.study.problem import Problem, Truth
 
 
@@ -36,16 +36,16 @@ def gallery(monkeypatch):
         monkeypatch.delitem(SCENES, name)
     for build in (fall, ruin, swing):
         monkeypatch.setitem(SCENES, build.__name__, build)
-    monkeypatch.setattr("physjax.study.problem.FILM", 16)
+    monkeypatch.setattr("physjax.study.problem.FILM_FRAMES", 16)
 
 
 def test_a_scene_is_told_with_its_size_and_its_truths():
-    told, _ = entry("balls_in_a_box")
+    told, _ = describe_scene("balls_in_a_box")
     assert told.size == "64 particles in 2-D, 2 s"
     assert told.truth.startswith("closed form; every |velocity component| is what it was")
-    told, _ = entry("heavy_top")
+    told, _ = describe_scene("heavy_top")
     assert told.size == "2 bodies in 3-D, 1.96 s"
-    told, _ = entry("hanging_rope")
+    told, _ = describe_scene("hanging_rope")
     assert told.size == "25 particles in 2-D, 24 springs, 4 s"
     assert "catenary" in str(told)
     assert max(map(len, str(told).splitlines())) <= 110

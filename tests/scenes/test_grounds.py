@@ -14,7 +14,7 @@ HILL = Hill(0.4, 1.5, 20.0, 3.0)
 
 
 def slope_of_the_gap(surface, place):
-    return jax.vmap(jax.grad(lambda x: surface.gap(0.0, x)))(place)
+    return jax.vmap(jax.grad(lambda x: surface.signed_distance(0.0, x)))(place)
 
 
 @pytest.mark.parametrize(
@@ -30,31 +30,31 @@ def slope_of_the_gap(surface, place):
 )
 def test_a_kerb_is_as_far_as_the_nearest_of_its_parts(place, normal, gap):
     place = np.array([place])
-    np.testing.assert_allclose(KERB.gap(0.0, place), gap, atol=1e-12)
-    np.testing.assert_allclose(KERB.outward(0.0, place)[0], normal, atol=1e-12)
+    np.testing.assert_allclose(KERB.signed_distance(0.0, place), gap, atol=1e-12)
+    np.testing.assert_allclose(KERB.normal_at(0.0, place)[0], normal, atol=1e-12)
     np.testing.assert_allclose(slope_of_the_gap(KERB, place)[0], normal, atol=1e-12)
 
 
 def test_on_a_hill_the_gap_grows_along_its_normal_and_bends_as_it_does():
     x = np.linspace(10.0, 30.0, 101)
     place = np.stack([x, np.asarray(HILL.height(x)[0])], axis=-1)
-    np.testing.assert_allclose(HILL.gap(0.0, place), 0.0, atol=1e-12)
-    np.testing.assert_allclose(slope_of_the_gap(HILL, place), HILL.outward(0.0, place), atol=1e-12)
+    np.testing.assert_allclose(HILL.signed_distance(0.0, place), 0.0, atol=1e-12)
+    np.testing.assert_allclose(slope_of_the_gap(HILL, place), HILL.normal_at(0.0, place), atol=1e-12)
     slope = np.asarray(HILL.height(x)[1])
     velocity = np.stack([np.full_like(x, 7.0), 7.0 * slope], axis=-1)
 
     def gap(t, place, velocity):
-        return HILL.gap(t, place + t * velocity)
+        return HILL.signed_distance(t, place + t * velocity)
 
-    bend = jax.vmap(jax.grad(jax.grad(gap)), in_axes=(None, 0, 0))(0.0, place, velocity)
-    np.testing.assert_allclose(HILL.bend(0.0, place, velocity), bend, atol=1e-10)
+    curvature_acceleration = jax.vmap(jax.grad(jax.grad(gap)), in_axes=(None, 0, 0))(0.0, place, velocity)
+    np.testing.assert_allclose(HILL.curvature_acceleration(0.0, place, velocity), curvature_acceleration, atol=1e-10)
 
 
 def test_a_profile_is_drawn_from_side_to_side():
     stage = Stage(np.array([10.0, -1.0, -2.0]), np.array([16.0, 1.0, 2.0]))
-    ground, face, top = obstacles.sheets_of(KERB, stage, 0.0)
+    ground, face, top = obstacles.build_sheets(KERB, stage, 0.0)
     np.testing.assert_allclose(face[:, 0], 13.0)
     np.testing.assert_allclose([np.ptp(ground[:, 2]), np.ptp(face[:, 1]), top[:, 1].min()], [4.0, 0.4, 0.4])
     before = stage._replace(high=np.array([12.0, 1.0, 2.0]))
-    (ground,) = obstacles.sheets_of(KERB, before, 0.0)
+    (ground,) = obstacles.build_sheets(KERB, before, 0.0)
     assert np.ptp(ground[:, 1]) == 0.0

@@ -6,7 +6,7 @@ import pytest
 
 from physjax import methods, simulate
 from physjax.scenes import SCENES, title
-from physjax.scenes.registry import table
+from physjax.scenes.registry import read_table
 
 SLOW = ("car", "ragdoll", "tumbling_box", "rolling", "bowling", "smoke", "sparks")
 """What compiles for many seconds."""
@@ -45,7 +45,7 @@ def errors_in_km(method, dt_days, days):
     problem = SCENES["solar_system"]()
     steps = round(days / dt_days)
     end = simulate(problem.scene, method, dt=days * 86400.0 / steps, steps=steps, save_every=steps).final_scene.state
-    ephemeris = table("solar_system_de421.csv")
+    ephemeris = read_table("solar_system_de421.csv")
     then = ephemeris["julian_date_tdb"] == ephemeris["julian_date_tdb"].min() + days
     position = np.stack([ephemeris[c][then] for c in ("x_m", "y_m", "z_m")], axis=-1)
     off = np.linalg.norm(np.asarray(end.position) - position, axis=-1) / 1e3

@@ -12,11 +12,11 @@ from PIL import Image
 
 from physjax import Particles, Scene, animate, contacts, forces, methods, simulate
 from physjax.show.films import schedule
-from physjax.show.frames import Take
+from physjax.show.frames import Frames
 
 
 def clock(times):
-    return Take(np.asarray(times, float), np.zeros((len(times), 1, 2)), len(times), ())
+    return Frames(np.asarray(times, float), np.zeros((len(times), 1, 2)), len(times), ())
 
 
 def played(path):
@@ -48,7 +48,7 @@ def test_fewer_frames_than_pictures_are_shown_once_each():
 
 
 def test_the_last_good_frame_is_always_shown():
-    frames, _ = schedule("", clock(np.arange(101) / 100)._replace(good=48), 30.0, 1.0)
+    frames, _ = schedule("", clock(np.arange(101) / 100)._replace(good_frames=48), 30.0, 1.0)
     assert frames[-1] == 47
 
 
@@ -111,7 +111,7 @@ def test_a_notebook_shows_it_once(swarm):
 
 def test_bad_names_are_refused_before_anything_is_drawn(swarm, tmp_path):
     film = animate.paths(swarm)
-    film._projector = None
+    film._build_renderer = None
     with pytest.raises(ValueError, match=r"got film.mp4, expected a name that ends in .gif or .html"):
         film.save(tmp_path / "film.mp4")
     with pytest.raises(FileNotFoundError, match=r"the folder .*nowhere does not exist. Create it first"):
@@ -145,10 +145,10 @@ def test_limits_stay_and_the_time_runs(ruin):
 def test_a_run_that_blew_up_ends_at_its_last_good_frame_and_says_so(burst):
     run, sheet = burst
     film = animate.cloth(run, sheet)
-    good = np.isfinite(run.position).all(axis=(1, 2)).sum()
-    assert film.frames[-1] == good - 1
+    good_frames = np.isfinite(run.position).all(axis=(1, 2)).sum()
+    assert film.frames[-1] == good_frames - 1
     ax = film.still(-1).axes[0]
-    assert ax.get_title().endswith(f"blew up after t = {run.time[good - 1]:.3g} s")
+    assert ax.get_title().endswith(f"blew up after t = {run.time[good_frames - 1]:.3g} s")
     assert np.ptp(ax.get_xlim()) < 1e3
 
 
@@ -166,7 +166,7 @@ def test_a_wall_that_moves_is_drawn_where_it_is():
     piston = contacts.Plane((0.0, 0.0), (1.0, 0.0), velocity=(1.0, 0.0), response=contacts.project)
     state = Particles(np.array([[0.05, 0.0], [2.0, 1.0]]), np.zeros((2, 2)))
     film = animate.paths(simulate(Scene(state, contacts=(piston,)), methods.verlet, dt=0.1, steps=10))
-    figure, show = film._projector()
+    figure, show = film._build_renderer()
     for frame in (0, 10, 4):
         show(frame)
         _wrong_side, edge, _trail, _dots = figure.axes[0].collections

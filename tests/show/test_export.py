@@ -160,7 +160,7 @@ def test_too_many_frames_and_bad_places_are_refused_before_anything_is_written(s
 
 
 def test_a_sequence_that_fails_leaves_no_folder(swarm, tmp_path, monkeypatch):
-    monkeypatch.setattr("physjax.show.export._ply", lambda *_: 1 / 0)
+    monkeypatch.setattr("physjax.show.export._encode_ply", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         export.ply(swarm, tmp_path / "frames", progress=False)
     assert not list(tmp_path.iterdir())

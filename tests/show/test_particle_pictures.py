@@ -42,7 +42,7 @@ def test_dots_are_those_alive_and_age():
 
 def test_the_light_of_what_glows_adds_up():
     paper, wide = np.asarray([[30.5, 20.5], [30.5, 20.5], [70.5, 20.5]]), np.full(3, 16.0)
-    seen = lights.glow(paper, wide, np.asarray([[0.2, 0.1, 0.0]] * 3), (41, 101))
+    seen = lights.render_glow(paper, wide, np.asarray([[0.2, 0.1, 0.0]] * 3), (41, 101))
     light = seen[..., :3] * seen[..., 3:]
     np.testing.assert_allclose(light[20, [30, 70]], [[0.4, 0.2, 0.0], [0.2, 0.1, 0.0]], atol=1e-6)
     # a bell curve that at half the radius has fallen to e^-1/2

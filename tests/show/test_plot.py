@@ -12,7 +12,7 @@ from physjax.show import plot, style
 from physjax.stepping.methods import METHODS
 from physjax.study import report_page
 from physjax.study.accuracy import Budget, work_precision
-from physjax.text import seconds_text, table
+from physjax.text import format_seconds, format_table
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ def test_a_study_is_drawn_with_its_failures():
     assert "energy" in kept.get_ylabel()
     assert speed.get_xscale() == speed.get_yscale() == "log"
     crosses = [line for line in order.lines if line.get_marker() == "x" and len(line.get_xdata())]
-    limited = [method for method in METHODS.values() if math.isfinite(method.promises.stable_to)]
+    limited = [method for method in METHODS.values() if math.isfinite(method.promises.stability_limit)]
     assert len(crosses) == len(limited)  # every explicit method fails at a sixth of a second on the stiff spring
     legend = " ".join(text.get_text() for text in figure.legends[0].get_texts())
     assert "rk4: order" in legend
@@ -69,7 +69,7 @@ def test_methods_keep_apart_in_colour_and_marker():
 
 def test_both_treatments_of_a_bounce_are_told_apart_and_belong_together():
     for name in METHODS:
-        timed, projected = plot.style(name), plot.style(name + style.PROJECTED)
+        timed, projected = plot.style(name), plot.style(name + style.PROJECTED_SUFFIX)
         assert (projected["color"], projected["marker"]) == (timed["color"], timed["marker"])
         assert (timed["linestyle"], projected["linestyle"]) == ("-", "--")
         assert projected["markerfacecolor"] == "white"
@@ -80,7 +80,10 @@ def test_the_legend_has_room_below_the_panels():
         SCENES["tennis_ball"](), [methods.verlet], [0.01], budget=Budget(0.02, 1, 2.0), name="tennis"
     )
     runs = tuple(
-        run._replace(method=name + end) for run in study.runs for name in METHODS for end in ("", style.PROJECTED)
+        run._replace(method=name + end)
+        for run in study.runs
+        for name in METHODS
+        for end in ("", style.PROJECTED_SUFFIX)
     )
     figure = study._replace(runs=runs, promised={run.method: 1.0 for run in runs}).plot()
     figure.canvas.draw()
@@ -96,7 +99,7 @@ def test_the_legend_has_room_below_the_panels():
 
 
 def test_table_is_aligned():
-    aligned = table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
+    aligned = format_table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
     lines = aligned.splitlines()
     assert len({len(line) for line in lines}) == 1
     assert lines[2].startswith("euler ")
@@ -108,11 +111,11 @@ def test_table_is_aligned():
     [(0.99999994, "1 s"), (3e-6, "3 µs"), (0.0123, "12.3 ms"), (2.5, "2.5 s"), (86400 * 10, "10 d")],
 )
 def test_times_are_readable(seconds, text):
-    assert seconds_text(seconds) == text
+    assert format_seconds(seconds) == text
 
 
 def test_page_is_self_contained():
-    page = report_page.page(
+    page = report_page.build_page(
         "title",
         "a < b",
         [

@@ -6,8 +6,8 @@ import pytest
 
 from physjax import Particles, Scene, animate, inertia, methods, plot, rigid, simulate
 from physjax.show import solids
-from physjax.show.solids import taken_bodies
-from physjax.show.surfaces import looks_away
+from physjax.show.solids import take_bodies
+from physjax.show.surfaces import find_back_faces
 
 BRICK = inertia.box(1.0, (1.0, 2.0, 3.0))
 STILL = rigid.bodies(BRICK, position=[[0.0, 0, 0], [5, 0, 0]], orientation=[[1.0, 0, 0, 0], [1, 0, 0, 1]])
@@ -42,7 +42,7 @@ def test_shapes_lie_along_their_axis_and_are_joined():
 
 
 def test_every_body_is_drawn_where_it_is_and_as_it_stands():
-    seen, faces = taken_bodies("plot.bodies", FILM, solids.box((1.0, 2.0, 3.0)))
+    seen, faces = take_bodies("plot.bodies", FILM, solids.box((1.0, 2.0, 3.0)))
     assert (seen.position.shape, faces.max()) == ((3, 16, 3), 15)
     np.testing.assert_allclose(np.ptp(seen.position[0, :8], axis=0), [1, 2, 3], rtol=1e-6)
     np.testing.assert_allclose(np.ptp(seen.position[0, 8:], axis=0), [2, 1, 3], rtol=1e-6)  # a quarter turn about z
@@ -67,7 +67,7 @@ def test_the_far_side_of_a_body_is_drawn_before_its_near_one():
     assert far + near == 12 + len(solids.sphere(1.0).faces)
     assert min(far, near) > 0.3 * (far + near)
     top = np.array([[[0.0, 1, 0], [0, 1, 1], [1, 1, 0]]])  # seen from above
-    assert looks_away(np.concatenate([top, top[:, ::-1]]), ax).tolist() == [False, True]
+    assert find_back_faces(np.concatenate([top, top[:, ::-1]]), ax).tolist() == [False, True]
 
 
 @pytest.mark.usefixtures("unannotated")

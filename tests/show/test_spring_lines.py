@@ -7,7 +7,7 @@ from matplotlib.collections import LineCollection
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from physjax import Particles, Scene, Trajectory, forces, lattices, methods, plot, simulate, springs
-from physjax.show.spring_lines import Strands
+from physjax.show.spring_lines import SpringLines
 
 
 def layers(ax):
@@ -29,7 +29,7 @@ def test_colours_are_strains_and_broken_springs_are_dashed(ruin):
     held = np.asarray(film.parts[0].unbroken)
     assert held[0].all()
     assert 0 < held[-1].sum() < held[-1].size
-    shade = Strands(sheet.springs.pairs, np.ones(1), None, 0.02).colours()
+    shade = SpringLines(sheet.springs.pairs, np.ones(1), None, 0.02).colours()
     for ax, frame in zip(panels, (0, 2, -1), strict=True):
         whole, broken = layers(ax)
         lines = np.asarray(film.position[frame])[sheet.springs.pairs[held[frame]]]
@@ -41,7 +41,7 @@ def test_colours_are_strains_and_broken_springs_are_dashed(ruin):
 
 
 def test_pressed_is_blue_stretched_is_orange_and_rest_is_grey():
-    shade = Strands(np.zeros((1, 2), int), np.ones(1), None, 0.1).colours()
+    shade = SpringLines(np.zeros((1, 2), int), np.ones(1), None, 0.1).colours()
     pressed, rest, stretched = shade.to_rgba([-10.0, 0.0, 10.0])[:, :3]
     assert pressed[2] > pressed[0] + 0.4
     assert stretched[0] > stretched[2] + 0.4
@@ -76,7 +76,9 @@ def test_the_wrong_side_of_a_floor_is_shaded_in_the_plane(swarm):
 
 
 def test_a_spring_without_rest_length_and_one_at_rest():
-    strain = Strands(np.array([[0, 1], [0, 1]]), np.array([0.0, 1.0]), None, 1.0).strain(np.array([[0.0, 0], [2.0, 0]]))
+    strain = SpringLines(np.array([[0, 1], [0, 1]]), np.array([0.0, 1.0]), None, 1.0).strain(
+        np.array([[0.0, 0], [2.0, 0]])
+    )
     assert strain.tolist() == [np.inf, 1.0]
 
 

@@ -8,9 +8,9 @@ from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from physjax import Particles, Scene, contacts, forces, lattices, methods, plot, rigid, simulate
 from physjax.show import obstacles
-from physjax.show.obstacles import LIGHT
+from physjax.show.obstacles import LIGHT_DIRECTION
 from physjax.show.stage import Stage
-from physjax.show.surfaces import AMBIENT, brightness
+from physjax.show.surfaces import AMBIENT_BRIGHTNESS, compute_brightness
 
 CUBE = Stage(np.zeros(3), np.ones(3))
 
@@ -42,7 +42,7 @@ def test_every_face_is_drawn_at_every_frame_that_was_asked_for(drape):
     for ax in figure.axes:
         assert polygons(ax) == len(sheet.faces) == 40
         assert polygons(ax, zorders=(3,)) == len(
-            obstacles.balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[0].corners
+            obstacles.find_balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[0].corners
         )
         assert polygons(ax, zorders=(0,)) == 1  # the floor
         assert len(ax.collections) <= 4  # however many faces
@@ -120,52 +120,52 @@ def test_one_of_a_batch_of_scenes_is_drawn():
 
 
 def test_faces_are_lit_by_their_angle_to_the_light_from_both_sides():
-    across = np.cross(LIGHT, [0.0, 1.0, 0.0])
+    across = np.cross(LIGHT_DIRECTION, [0.0, 1.0, 0.0])
     across /= np.linalg.norm(across)
-    other = np.cross(LIGHT, across)
+    other = np.cross(LIGHT_DIRECTION, across)
     angles = np.array([0.0, 0.7, np.pi / 2])
-    normals = np.cos(angles)[:, None] * LIGHT + np.sin(angles)[:, None] * other
+    normals = np.cos(angles)[:, None] * LIGHT_DIRECTION + np.sin(angles)[:, None] * other
     triangles = np.stack([np.zeros((3, 3)), np.broadcast_to(across, (3, 3)), np.cross(normals, across)], axis=1)
     faces = np.arange(9).reshape(3, 3)
-    seen = brightness(triangles.reshape(9, 3), faces)
-    np.testing.assert_allclose(seen, AMBIENT + (1 - AMBIENT) * np.cos(angles), atol=1e-12)
-    np.testing.assert_allclose(brightness(triangles.reshape(9, 3), faces[:, ::-1]), seen, atol=1e-12)
+    seen = compute_brightness(triangles.reshape(9, 3), faces)
+    np.testing.assert_allclose(seen, AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * np.cos(angles), atol=1e-12)
+    np.testing.assert_allclose(compute_brightness(triangles.reshape(9, 3), faces[:, ::-1]), seen, atol=1e-12)
 
 
 def test_a_bent_sheet_is_smooth_and_a_block_keeps_its_edges():
     def fold(angle):
         corners = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [-np.cos(angle), np.sin(angle), 0]])
-        return brightness(corners.astype(float), np.array([[0, 1, 2], [0, 3, 1]]))
+        return compute_brightness(corners.astype(float), np.array([[0, 1, 2], [0, 3, 1]]))
 
     soft, hard = fold(0.4), fold(np.pi / 2)
-    alone = [brightness(np.array([[0, 0, 0], [0, 0, 1.0], [1.0, 0, 0]]), np.array([[0, 1, 2]]))[0]]
+    alone = [compute_brightness(np.array([[0, 0, 0], [0, 0, 1.0], [1.0, 0, 0]]), np.array([[0, 1, 2]]))[0]]
     assert abs(hard[0] - alone[0]) < 1e-12
     assert abs(soft[0] - alone[0]) > 1e-3
 
 
 def test_a_face_without_area_is_no_trouble():
-    assert brightness(np.zeros((3, 3)), np.array([[0, 1, 2]])).tolist() == [AMBIENT]
+    assert compute_brightness(np.zeros((3, 3)), np.array([[0, 1, 2]])).tolist() == [AMBIENT_BRIGHTNESS]
 
 
 # what is in the way
 
 
 def test_a_plane_is_cut_to_the_box():
-    floor = obstacles._cut(CUBE, np.array([0.3, 0.5, 0.3]), np.array([0.0, 1.0, 0.0]))
+    floor = obstacles._cut_box(CUBE, np.array([0.3, 0.5, 0.3]), np.array([0.0, 1.0, 0.0]))
     assert area(floor) == pytest.approx(1.0)
-    slope = obstacles._cut(CUBE, np.full(3, 0.5), np.full(3, 3**-0.5))
+    slope = obstacles._cut_box(CUBE, np.full(3, 0.5), np.full(3, 3**-0.5))
     assert len(slope) == 6
     assert area(slope) == pytest.approx(0.75 * 3**0.5)
-    assert len(obstacles._cut(CUBE, np.full(3, 2.0), np.array([0.0, 1.0, 0.0]))) == 0
+    assert len(obstacles._cut_box(CUBE, np.full(3, 2.0), np.array([0.0, 1.0, 0.0]))) == 0
 
 
 def test_a_floor_that_is_near_comes_into_the_picture_and_a_far_one_does_not():
     near, far = (contacts.Plane((0, y, 0), (0, 1, 0)) for y in (-0.2, -50.0))
-    assert obstacles.with_obstacles(CUBE, (near,)).low[1] == pytest.approx(-0.2)
-    assert obstacles.with_obstacles(CUBE, (far,)).low[1] == 0.0
+    assert obstacles.include_obstacles(CUBE, (near,)).low[1] == pytest.approx(-0.2)
+    assert obstacles.include_obstacles(CUBE, (far,)).low[1] == 0.0
     planet = contacts.Sphere((0, -6e6, 0), 6e6)
-    assert obstacles.with_obstacles(CUBE, (planet,)).low[1] == 0.0
-    assert obstacles.with_obstacles(CUBE, (contacts.Room((-0.5,) * 3, (1.5,) * 3),)).high[0] == 1.5
+    assert obstacles.include_obstacles(CUBE, (planet,)).low[1] == 0.0
+    assert obstacles.include_obstacles(CUBE, (contacts.Room((-0.5,) * 3, (1.5,) * 3),)).high[0] == 1.5
 
 
 def test_every_shape_is_drawn_in_space():
@@ -185,20 +185,22 @@ def test_every_shape_is_drawn_in_space():
 
 def test_surfaces_that_move_are_drawn_where_they_are_and_those_that_differ_are_left_out():
     bat = contacts.Sphere((0, 0, 0), 0.1, velocity=(2.0, 0, 0))
-    (ball,) = obstacles.balls(CUBE, (bat,), 0.25)
+    (ball,) = obstacles.find_balls(CUBE, (bat,), 0.25)
     np.testing.assert_allclose(ball.center, [0.5, 0, 0])
     assert len(ball.corners) == len(ball.normals) > 100
-    assert len(obstacles.balls(CUBE, (bat,), 1.0)[0].corners) == 0
-    assert obstacles.with_obstacles(CUBE, (bat,), (0.0, 0.75)).high[0] == 1.6
+    assert len(obstacles.find_balls(CUBE, (bat,), 1.0)[0].corners) == 0
+    assert obstacles.include_obstacles(CUBE, (bat,), (0.0, 0.75)).high[0] == 1.6
     ramp = contacts.Plane(np.zeros((4, 3)), (0, 1, 0))
-    assert obstacles.shown((bat, ramp)) == (bat,)
+    assert obstacles.select_shared_surfaces((bat, ramp)) == (bat,)
 
 
 def test_of_what_bodies_touch_the_surface_is_drawn():
     floor = contacts.Plane((0.0, 0.5, 0.0), (0.0, 1.0, 0.0))
-    shown = obstacles.shown((rigid.Touch(rigid.Hull.sphere(0.1), floor), rigid.Balls(0.1)))
+    shown = obstacles.select_shared_surfaces(
+        (rigid.SurfaceContact(rigid.ContactPoints.sphere(0.1), floor), rigid.Balls(0.1))
+    )
     assert shown[0] is floor
-    assert [len(obstacles.sheets_of(surface, CUBE, 0.0)) for surface in shown] == [1, 0]
+    assert [len(obstacles.build_sheets(surface, CUBE, 0.0)) for surface in shown] == [1, 0]
 
 
 def test_what_is_behind_a_ball_is_known(drape):
@@ -206,9 +208,9 @@ def test_what_is_behind_a_ball_is_known(drape):
     ax = plot.cloth(film, sheet, 0).axes[0]
     up, turn = np.radians([ax.elev, ax.azim])
     eye = np.array([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)])
-    ball = obstacles.balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)
+    ball = obstacles.find_balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)
     points = ball[0].center + np.array([eye, -eye, -eye + [0, 1.0, 0]]) * 0.4
-    assert obstacles.hidden(ball, points, ax).tolist() == [False, True, False]
+    assert obstacles.find_hidden(ball, points, ax).tolist() == [False, True, False]
 
 
 # bad input

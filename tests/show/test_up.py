@@ -8,8 +8,8 @@ import pytest
 
 from physjax import Particles, Scene, animate, contacts, forces, methods, simulate
 from physjax.show import export, obstacles, plot
-from physjax.show.auto_plot import still
-from physjax.show.solids import _turned
+from physjax.show.auto_plot import plot_run
+from physjax.show.solids import _rotate
 
 
 def thrown(up):
@@ -24,7 +24,7 @@ def thrown(up):
 
 def pixels(run):
     """The last picture of a film, without the names and numbers of the axes."""
-    figure = animate.paths(run).still(-1)
+    figure = animate.paths(run).plot_run(-1)
     figure.set_dpi(40)
     ax = figure.axes[0]
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
@@ -44,10 +44,10 @@ def test_a_film_of_another_up_is_the_same_but_for_the_names_of_the_axes():
 @pytest.mark.parametrize("up", [0, 1, 2])
 def test_axes_in_space_stand_on_the_ground(up):
     run = thrown(up)
-    for ax in (plot.paths(run), still(run).axes[0], animate.paths(run).still(0).axes[0]):
+    for ax in (plot.paths(run), plot_run(run).axes[0], animate.paths(run).plot_run(0).axes[0]):
         assert ax._vertical_axis == up
     assert animate.view(run)._content["up"] == up
-    lamp = obstacles.upright(obstacles.LIGHT, up)
+    lamp = obstacles.orient_up(obstacles.LIGHT_DIRECTION, up)
     assert lamp.argmax() == up
 
 
@@ -61,4 +61,4 @@ def test_gltf_is_y_up_whatever_the_scene_is(up, tmp_path):
         return
     x, y, z, w = root["rotation"]
     assert root["children"] == [0]
-    np.testing.assert_allclose(_turned(np.array([w, x, y, z]), np.eye(3)[up]), [0.0, 1.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(_rotate(np.array([w, x, y, z]), np.eye(3)[up]), [0.0, 1.0, 0.0], atol=1e-15)

@@ -13,7 +13,7 @@ import pytest
 
 from physjax import Particles, Scene, animate, contacts, forces, inertia, lattices, methods, rigid, simulate
 from physjax.show import solids
-from physjax.show.view import FINEST, HIDDEN
+from physjax.show.view import HIDDEN_CODE, QUANTISATION_STEPS
 
 
 def content(view):
@@ -30,8 +30,8 @@ def unpacked(text, dtype, *shape):
 def positions(film):
     part, (low, high) = film["part"], np.array(film["reach"])
     whole = unpacked(part["places"], np.int16, -1, part["nodes"], 3)
-    place = (low + high) / 2 + whole / FINEST * (high - low) / 2
-    return np.where(whole[..., :1] == HIDDEN, np.nan, place), (high - low) / 2 / FINEST
+    place = (low + high) / 2 + whole / QUANTISATION_STEPS * (high - low) / 2
+    return np.where(whole[..., :1] == HIDDEN_CODE, np.nan, place), (high - low) / 2 / QUANTISATION_STEPS
 
 
 def test_a_cloth_is_told_to_the_last_step_of_sixteen_bits(drape):
@@ -99,8 +99,8 @@ def test_bodies_keep_their_shape_and_their_turn():
     spun = rigid.bodies(brick, [[0.0, 0, 0], [1, 0, 0]], angular_velocity=[[1.0, 2, 3], [0, 0, 5]])
     run = simulate(Scene(spun, brick), methods.rk4, dt=0.01, steps=30)
     film = content(animate.view(run, fps=100, shown=[solids.box((0.1, 0.2, 0.3)), solids.sphere(0.1)]))
-    turns = unpacked(film["part"]["turns"], np.int16, -1, 2, 4) / FINEST
-    np.testing.assert_allclose(np.roll(turns, 1, axis=-1), run.state.orientation, atol=0.51 / FINEST)
+    turns = unpacked(film["part"]["turns"], np.int16, -1, 2, 4) / QUANTISATION_STEPS
+    np.testing.assert_allclose(np.roll(turns, 1, axis=-1), run.state.orientation, atol=0.51 / QUANTISATION_STEPS)
     found, step = positions(film)
     assert (np.abs(found - run.position) <= 0.51 * step).all()
     own = content(animate.view(run))["part"]["shapes"][0]  # no shape given: the box of the same inertia
@@ -111,7 +111,7 @@ def test_bodies_keep_their_shape_and_their_turn():
 def test_a_body_without_a_shape_is_the_box_of_its_inertia(about):
     turn = np.array([0.8, 0.0, 0.6, 0.0])
     body = inertia.composite([(inertia.box(3.0, (0.3, 0.1, 0.2)), (0.0, 0.0, 0.0), turn)]).inertia
-    solid = solids.solid_of(body.about((0.1, 0.2, 0.0)) if about else body)
+    solid = solids.build_inertia_box(body.about((0.1, 0.2, 0.0)) if about else body)
     again = inertia.mesh(solid.vertices, solid.faces, mass=3.0).inertia
     np.testing.assert_allclose(again.tensor, body.tensor, rtol=1e-6, atol=1e-9)
 

@@ -238,7 +238,7 @@ def test_a_force_of_ones_own_that_tells_its_mean_but_no_times_is_seen_by_the_err
         def __call__(self, t, state, mass):
             return jnp.where((t >= 0.1) & (t < 0.11), 100.0, 0.0) * jnp.ones_like(state.velocity)
 
-        def during(self, t, dt, state):
+        def averaged_over_step(self, t, dt, state):
             share = jnp.clip(0.11, t, t + dt) - jnp.clip(0.1, t, t + dt)
             return forces.Constant(100 * share / dt * jnp.ones_like(state.velocity))
 

@@ -11,7 +11,7 @@ import pytest
 from physjax import Particles, Scene, forces, methods, simulate
 from physjax.checks import quantity
 from physjax.physics.forces import independent
-from physjax.stepping.blocks import FEWEST_STEPS, SMALLEST, Blocks
+from physjax.stepping.blocks import MIN_LANES_TO_CUT, MIN_STEPS_PER_FRAME, Blocks
 from physjax.vectors import dot
 
 pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="lanes are cut for a CPU's cache only")
@@ -31,9 +31,9 @@ def per_lane(lanes, low, high):
 
 def runs(scene, dt=0.01, method=methods.semi_implicit_euler):
     """The same run in blocks and uncut: too few steps between frames are not worth a cut, so both can be asked for."""
-    few = FEWEST_STEPS // 2
-    blocked = simulate(scene, method, dt=dt, steps=2 * FEWEST_STEPS, save_every=FEWEST_STEPS)
-    uncut = simulate(scene, method, dt=dt, steps=2 * FEWEST_STEPS, save_every=few)
+    few = MIN_STEPS_PER_FRAME // 2
+    blocked = simulate(scene, method, dt=dt, steps=2 * MIN_STEPS_PER_FRAME, save_every=MIN_STEPS_PER_FRAME)
+    uncut = simulate(scene, method, dt=dt, steps=2 * MIN_STEPS_PER_FRAME, save_every=few)
     return blocked, uncut
 
 
@@ -48,7 +48,7 @@ class Stretchy(eqx.Module):
         return -jnp.stack([dot(row, state.position) for row in rows], axis=-1)
 
 
-ODD = (SMALLEST + 5,)
+ODD = (MIN_LANES_TO_CUT + 5,)
 PLANE = (401, 333)
 CASES = {
     "a lane count that does not divide": lambda: (crowd(ODD), 0.01),
@@ -74,8 +74,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_blocks_give_the_numbers_of_the_uncut_run(case):
     scene, dt = CASES[case]()
-    assert Blocks.of(scene, scene.state, FEWEST_STEPS) is not None
-    assert Blocks.of(scene, scene.state, FEWEST_STEPS // 2) is None
+    assert Blocks.of(scene, scene.state, MIN_STEPS_PER_FRAME) is not None
+    assert Blocks.of(scene, scene.state, MIN_STEPS_PER_FRAME // 2) is None
     blocked, uncut = runs(scene, dt)
     eps = float(jnp.finfo(scene.state.dtype).eps)
     for mine, theirs in zip(blocked.state, uncut.state, strict=True):
@@ -88,7 +88,7 @@ def test_blocks_give_the_numbers_of_the_uncut_run(case):
 
 
 def test_one_bad_lane_is_found_in_its_place_and_harms_no_other():
-    bad = SMALLEST // 2 + 17
+    bad = MIN_LANES_TO_CUT // 2 + 17
     stiffness = np.ones(ODD)
     calm = crowd(ODD, (forces.Anchor(point=jnp.zeros(2), stiffness=stiffness),))
     stiffness[bad] = 1e60
@@ -104,10 +104,10 @@ def test_coupled_lanes_and_bare_functions_are_never_cut():
         return -state.position
 
     for parts in (bare,), (independent(bare),), (forces.Gravitation(),), (forces.Gravity(), bare):
-        scene = crowd((SMALLEST,), parts)
-        assert Blocks.of(scene, scene.state, FEWEST_STEPS) is None
-    few = crowd((SMALLEST - 1,))
-    assert Blocks.of(few, few.state, FEWEST_STEPS) is None
+        scene = crowd((MIN_LANES_TO_CUT,), parts)
+        assert Blocks.of(scene, scene.state, MIN_STEPS_PER_FRAME) is None
+    few = crowd((MIN_LANES_TO_CUT - 1,))
+    assert Blocks.of(few, few.state, MIN_STEPS_PER_FRAME) is None
 
 
 class Fuse(eqx.Module):
@@ -140,7 +140,9 @@ def test_derivatives_go_through_blocks():
     def height(numbers):
         g, drag = numbers
         scene = Scene(start.state, forces=(forces.Gravity(g), forces.StokesDrag(drag)))
-        film = simulate(scene, methods.semi_implicit_euler, dt=0.01, steps=FEWEST_STEPS, save_every=FEWEST_STEPS)
+        film = simulate(
+            scene, methods.semi_implicit_euler, dt=0.01, steps=MIN_STEPS_PER_FRAME, save_every=MIN_STEPS_PER_FRAME
+        )
         return jnp.mean(film.position[-1, :, 1])
 
     numbers, h = jnp.asarray([9.8, 5.0]), 1e-4

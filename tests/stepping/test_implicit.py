@@ -15,7 +15,7 @@ from physjax.physics.springs import Springs
 from physjax.scene import as_module
 from physjax.stepping.krylov import conjugate_gradients, stabilised_biconjugate_gradients
 from physjax.stepping.methods import ImplicitEuler
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import sample_states
 
 DT = 1 / 60
 CONVERGED = ImplicitEuler(tolerance=1e-11, newton=20)
@@ -126,7 +126,7 @@ def test_converged_steps_equal_those_of_diffrax(case):
 @pytest.mark.parametrize("method", [methods.implicit_euler, CONVERGED], ids=["linearised", "converged"])
 def test_order_1_on_a_damped_rope(method):
     scene = crumpled(rope(5, stiffness=20.0, damping=0.1), 0.02)
-    ends = [sample(scene, as_module(method), 0.2 / n, n, frames=1).position[-1] for n in (256, 512, 1024, 2048)]
+    ends = [sample_states(scene, as_module(method), 0.2 / n, n, frames=1).position[-1] for n in (256, 512, 1024, 2048)]
     steps = [np.abs(a - b).max() for a, b in pairwise(ends)]
     np.testing.assert_allclose(np.log2(np.divide(steps[:-1], steps[1:])), 1.0, rtol=0, atol=0.15)
 
@@ -147,7 +147,7 @@ def test_the_tangent_of_springs_is_their_derivative_but_for_what_pushes_sideways
     springs = Springs([(0, 1)], 50.0, 1.0, nodes=2)
     for stretch in (1.4, 0.6):
         state = Particles(jnp.asarray([[0.0, 0.0], [stretch, 0.0]]), jnp.zeros((2, 2)))
-        tangent = springs.near(0.0, state, 1.0)
+        tangent = springs.linearised_at(0.0, state, 1.0)
         of = lambda force: jax.jacfwd(lambda x: force(0.0, Particles(x, 0 * x), 1.0))(state.position)  # noqa: E731, B023
         exact, found = of(springs), of(tangent)
         np.testing.assert_allclose(tangent(0.0, state, 1.0), springs(0.0, state, 1.0), rtol=1e-15)

@@ -13,7 +13,7 @@ from physjax import Particles, Scene, forces, methods, ode_term, reference, simu
 from physjax.physics.forces import independent
 from physjax.scene import as_module
 from physjax.stepping.methods import METHODS
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import sample_states
 from physjax.vectors import dot, norm
 
 ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
@@ -67,7 +67,7 @@ def test_evaluations_a_step(method):
 
 @ALL
 def test_stable_to_its_limit_and_not_beyond(method):
-    limit = method.promises.stable_to
+    limit = method.promises.stability_limit
 
     def radius(step):
         scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(forces.Anchor(point=jnp.zeros(1), stiffness=1.0),))
@@ -139,7 +139,7 @@ def test_order_is_the_promised_one(method, pendulum):
     promised = method.promises.order_with_drag if drag else method.promises.order
     errors = []
     for steps in (256, 512, 1024):
-        found = sample(scene, as_module(method), 2.0 / steps, steps, frames=1)
+        found = sample_states(scene, as_module(method), 2.0 / steps, steps, frames=1)
         errors.append(max(np.abs(a[-1] - b).max() for a, b in zip(found, truth, strict=True)))
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), promised, rtol=0, atol=0.15)
 

@@ -364,7 +364,7 @@ def test_a_cloths_loop_is_compiled_in_pieces(differentiated):
     scene = Scene(sheet.state, mass=sheet.mass, forces=(forces.Gravity(), sheet.springs))
 
     def lowest(speed):
-        thrown = scene.having(state=Particles(scene.state.position, scene.state.velocity + speed))
+        thrown = scene.replace(state=Particles(scene.state.position, scene.state.velocity + speed))
         return simulate(thrown, methods.rk4, dt=1e-3, steps=40, save_every=40).position[-1, :, 1].min()
 
     program = jax.jit(jax.grad(lowest) if differentiated else lowest).lower(0.1).compile().as_text()

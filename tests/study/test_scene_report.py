@@ -13,7 +13,7 @@ from physjax.scenes import SCENES, title
 from physjax.stepping.methods import METHODS
 from physjax.study import scene_report
 from physjax.study.accuracy.result import Run, WorkPrecision
-from physjax.study.scene_report import NO_RUN, PARTS, WANTED, Studied
+from physjax.study.scene_report import NO_RUN, PARTS, TARGET_ERROR, SceneStudy
 
 
 class Pictures(HTMLParser):
@@ -33,7 +33,7 @@ def small(monkeypatch):
     """Two methods, and a film of few pictures."""
     for name in set(METHODS) - {"verlet", "rk4"}:
         monkeypatch.delitem(METHODS, name)
-    monkeypatch.setattr("physjax.study.problem.FILM", 32)
+    monkeypatch.setattr("physjax.study.problem.FILM_FRAMES", 32)
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def of(name, *runs):
     with jax.enable_x64(True):
         problem = SCENES[name]()
     found = WorkPrecision(name, runs, {}, "closed form", 0.0, problem.duration, (), "float64", ([], []))
-    return Studied(name, title(name), problem, found)
+    return SceneStudy(name, title(name), problem, found)
 
 
 def run_of(method, error, seconds):
@@ -112,7 +112,9 @@ def test_a_touch_answered_in_a_way_of_its_own_has_no_ledger():
 
 
 def test_later_parts_follow_the_cheapest_of_our_runs_that_is_true_enough():
-    coarse, good, finer = (run_of("rk4", error, s) for error, s in ((3 * WANTED, 0.1), (WANTED, 0.2), (1e-9, 0.3)))
+    coarse, good, finer = (
+        run_of("rk4", error, s) for error, s in ((3 * TARGET_ERROR, 0.1), (TARGET_ERROR, 0.2), (1e-9, 0.3))
+    )
     rival, unsteady = run_of("diffrax Tsit5", 1e-9, 0.01), run_of("midpoint", 1e-9, 0.01)
     assert of("projectile", coarse, rival, unsteady, finer, good).run is good
     assert of("projectile", coarse, rival, run_of("verlet", 0.5, 0.01)).run is coarse

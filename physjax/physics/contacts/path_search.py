@@ -7,17 +7,17 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import any_lane, loop
+from physjax.backend import any_lane, bounded_while_loop
 from physjax.particles import Particles
 from physjax.vectors import norm, scale
 
-PLACES = 64
+MAX_PATH_SAMPLES = 64
 """Most places of a path that are looked at, and the share of it that is gone over unseen from where it leaves a surface."""
-BOLD = 4.0
+MAX_NEWTON_STRETCH = 4.0
 """How much farther than the distance a path goes on where its slope promises that nothing is there."""
 
 
-def lowest_on_path(
+def find_path_dip(
     face: Any, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """The first dip of the gap on the cubic path through the ends of a leg, as a share of it, and its gap; else `dip`.
@@ -29,42 +29,44 @@ def lowest_on_path(
     p, chord = start.position, end.position - start.position
     u, w = scale(dt, start.velocity), scale(dt, end.velocity)
     b, a = 3.0 * chord - 2.0 * u - w, u + w - 2.0 * chord
-    gap = lambda s: face.gap(t + s * dt, p + scale(s, u + scale(s, b + scale(s, a))))  # noqa: E731
-    falling = lambda s: jax.jvp(gap, (s,), (jnp.ones_like(s),))  # noqa: E731
-    far = jnp.maximum(reach(face, dt, start, end), float(jnp.finfo(p.dtype).tiny))
+    signed_distance = lambda s: face.signed_distance(t + s * dt, p + scale(s, u + scale(s, b + scale(s, a))))  # noqa: E731
+    falling = lambda s: jax.jvp(signed_distance, (s,), (jnp.ones_like(s),))  # noqa: E731
+    far = jnp.maximum(bound_path_length(face, dt, start, end), float(jnp.finfo(p.dtype).tiny))
     touch = 64 * float(jnp.finfo(p.dtype).eps) * (norm(p) + far)
 
     def go_on(carry):
         s, d, slope, _ = carry
         free = jnp.maximum(d, 0.0) / far
-        newton = jnp.clip(d / jnp.where(slope < 0, -slope, 1.0), free, BOLD * free)
-        s = jnp.minimum(s + jnp.where(slope < 0, newton, jnp.maximum(free, 1 / PLACES)), 1.0)
+        newton = jnp.clip(d / jnp.where(slope < 0, -slope, 1.0), free, MAX_NEWTON_STRETCH * free)
+        s = jnp.minimum(s + jnp.where(slope < 0, newton, jnp.maximum(free, 1 / MAX_PATH_SAMPLES)), 1.0)
         d, slope = falling(s)
         return s, d, slope, (s < 1) & ((d > touch) | (slope >= 0))
 
     begin = jnp.zeros_like(far)
     d, slope = falling(begin)
-    s, d, slope, _ = loop(
+    s, d, slope, _ = bounded_while_loop(
         lambda carry: any_lane(carry[-1]),
         lambda carry: jax.tree.map(lambda new, old: jnp.where(carry[-1], new, old), go_on(carry), carry),
         (begin, d, slope, (d > touch) | (slope >= 0)),
-        most=PLACES,
+        most=MAX_PATH_SAMPLES,
     )
-    stride = jnp.clip(touch / jnp.where(slope < 0, -slope, 1.0), 0.0, 1 / PLACES)
+    stride = jnp.clip(touch / jnp.where(slope < 0, -slope, 1.0), 0.0, 1 / MAX_PATH_SAMPLES)
 
     def go_down(carry):
         s, d, stride, _ = carry
         further = jnp.minimum(s + stride, 1.0)
-        there = gap(further)
+        there = signed_distance(further)
         lower = carry[-1] & (there < d)
         return jnp.where(lower, further, s), jnp.where(lower, there, d), 2 * stride, lower
 
-    s, d, _, _ = loop(lambda carry: any_lane(carry[-1]), go_down, (s, d, stride, (s < 1) & (slope < 0)), most=PLACES)
+    s, d, _, _ = bounded_while_loop(
+        lambda carry: any_lane(carry[-1]), go_down, (s, d, stride, (s < 1) & (slope < 0)), most=MAX_PATH_SAMPLES
+    )
     found = (d < 0) & (s > 0)
     return jnp.where(found, s, dip[0]), jnp.where(found, d, dip[1])
 
 
-def reach(face: Any, dt: ArrayLike, start: Particles, end: Particles) -> Float[Array, "*lanes"]:
+def bound_path_length(face: Any, dt: ArrayLike, start: Particles, end: Particles) -> Float[Array, "*lanes"]:
     """How far at most the cubic path through the ends of a leg goes, as a surface sees it that may move [m]."""
     u, w = (scale(dt, face.relative(state.velocity)) for state in (start, end))
     chord = end.position - start.position + (u - scale(dt, start.velocity))

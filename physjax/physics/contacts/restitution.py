@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import concrete, demand, quantity
+from physjax.checks import concrete_or_none, demand_all, quantity
 from physjax.particles import Particles
 from physjax.vectors import dot, scale
 
@@ -25,16 +25,18 @@ class Coulomb(eqx.Module):
     kinetic: Float[Array, "..."] = quantity("kinetic friction μ_k", "1", at_least=0)
 
     def __check_init__(self):
-        static, kinetic = concrete(self.static), concrete(self.kinetic)
+        static, kinetic = concrete_or_none(self.static), concrete_or_none(self.kinetic)
         if static is not None and kinetic is not None:
-            demand("kinetic friction μ_k [1]", self.kinetic, kinetic <= static, f"at most the static μ_s = {static}")
+            demand_all(
+                "kinetic friction μ_k [1]", self.kinetic, kinetic <= static, f"at most the static μ_s = {static}"
+            )
 
     def relations(self) -> tuple[Array, ...]:
         """What must hold between its numbers, also where they are traced."""
         return (self.kinetic <= self.static,)
 
 
-def rebound(
+def apply_restitution(
     surface: eqx.Module,
     state: Particles,
     touch: tuple[Array, Array, Array],

@@ -17,13 +17,13 @@ class Nearest(NamedTuple):
     Example:
         >>> way = jnp.array([0.0, 2.0]), jnp.array([4.0, 2.0])
         >>> near = contacts.nearest_on_segment(contacts.Sphere((1.0, 0.0), 0.5), 0.0, *way)
-        >>> isinstance(near, contacts.Nearest), float(near.share), float(near.gap)
+        >>> isinstance(near, contacts.Nearest), float(near.share), float(near.signed_distance)
         (True, 0.25, 1.5)
     """
 
     share: Float[Array, "*lanes"]
     point: Float[Array, "*lanes dim"]
-    gap: Float[Array, "*lanes"]
+    signed_distance: Float[Array, "*lanes"]
 
 
 class Corners(NamedTuple):
@@ -32,11 +32,11 @@ class Corners(NamedTuple):
     Example:
         >>> feet = jnp.array([[0.0, 0.0], [1.0, 0.5]])
         >>> found = contacts.touching_corners(contacts.Plane((0.0, 0.0), (0.0, 1.0)), 0.0, feet)
-        >>> isinstance(found, contacts.Corners), found.gap.tolist(), found.touching.tolist()
+        >>> isinstance(found, contacts.Corners), found.signed_distance.tolist(), found.touching.tolist()
         (True, [0.0, 0.5], [True, False])
     """
 
-    gap: Float[Array, "*lanes corners"]
+    signed_distance: Float[Array, "*lanes corners"]
     touching: Bool[Array, "*lanes corners"]
 
 
@@ -50,15 +50,15 @@ def nearest_on_segment(
         >>> contacts.nearest_on_segment(floor, 0.0, jnp.array([0.0, 2.0]), jnp.array([4.0, 1.0])).point.tolist()
         [4.0, 1.0]
     """
-    best = Nearest(jnp.zeros_like(start[..., 0]), start, surface.gap(t, start))
+    best = Nearest(jnp.zeros_like(start[..., 0]), start, surface.signed_distance(t, start))
     for share in (jnp.ones_like(best.share), *surface.nearest_shares(t, start, end)):
         point = start + scale(share, end - start)
-        gap = surface.gap(t, point)
-        deeper = gap < best.gap
+        signed_distance = surface.signed_distance(t, point)
+        deeper = signed_distance < best.signed_distance
         best = Nearest(
             jnp.where(deeper, share, best.share),
             jnp.where(deeper[..., None], point, best.point),
-            jnp.where(deeper, gap, best.gap),
+            jnp.where(deeper, signed_distance, best.signed_distance),
         )
     return best
 
@@ -104,5 +104,5 @@ def touching_corners(
         >>> contacts.touching_corners(floor, 0.0, jnp.array([[0.0, 0.0], [1.0, 0.0]])).touching.tolist()
         [True, True]
     """
-    gap = surface.gap(t, corners)
-    return Corners(gap, gap <= tolerance)
+    signed_distance = surface.signed_distance(t, corners)
+    return Corners(signed_distance, signed_distance <= tolerance)

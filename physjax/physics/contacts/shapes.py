@@ -1,6 +1,6 @@
 """Surfaces that particles may not pass: each shape is a signed distance, and the answer to a touch is written once for all.
 
-`gap` [m] is positive on the legal side, zero on the surface, negative on the wrong side; `outward` points to the legal side.
+`signed_distance` [m] is positive on the legal side, zero on the surface, negative on the wrong side; `normal_at` points to the legal side.
 Shapes may move with a constant `velocity` [m/s] from where they are at t = 0 (a piston, a bat).
 """
 
@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, demand_direction, quantity
+from physjax.checks import concrete_or_none, demand_all, demand_direction, quantity
 from physjax.particles import Particles
-from physjax.physics.contacts.surface import ABOUT, Surface
-from physjax.vectors import dot, norm, over, scale, unit
+from physjax.physics.contacts.surface import INHERITED_FIELDS, Surface
+from physjax.vectors import broadcast_vector, dot, norm, scale, unit
 
-_TINY = 1e-30
+_SMALLEST_LENGTH_SQUARED = 1e-30
 
 
 class Plane(Surface):
@@ -24,7 +24,7 @@ class Plane(Surface):
 
     Example:
         >>> slope = contacts.Plane(point=(0.0, 5.0), normal=(3.0, 4.0))
-        >>> round(float(slope.gap(0.0, ball.position)), 3)
+        >>> round(float(slope.signed_distance(0.0, ball.position)), 3)
         4.0
     """
 
@@ -39,13 +39,13 @@ class Plane(Surface):
         """What must hold of its numbers, also where they are traced."""
         return (dot(self.normal, self.normal) > 0,)
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """(X - P)·N [m]."""
-        return self._height(t, position, self.outward(t, position))
+        return self._height(t, position, self.normal_at(t, position))
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """N, of length 1."""
-        return over(unit(self.normal), position)
+        return broadcast_vector(unit(self.normal), position)
 
 
 class Slab(Surface):
@@ -54,7 +54,7 @@ class Slab(Surface):
     With `inside=True` it is a corridor of that width: legal is what lies between its faces.
 
     Example:
-        >>> float(contacts.Slab((0.0, 0.0), (0.0, 1.0), thickness=2.0).gap(0.0, ball.position))
+        >>> float(contacts.Slab((0.0, 0.0), (0.0, 1.0), thickness=2.0).signed_distance(0.0, ball.position))
         9.0
     """
 
@@ -71,39 +71,39 @@ class Slab(Surface):
         """What must hold of its numbers, also where they are traced."""
         return (dot(self.normal, self.normal) > 0,)
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearer face [m]."""
-        height = jnp.abs(self._above(t, position))
+        height = jnp.abs(self._height_above_middle(t, position))
         return self.thickness / 2 - height if self.inside else height - self.thickness / 2
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """The normal of the nearer face."""
-        side = jnp.where((self._above(t, position) < 0) != self.inside, -1.0, 1.0)
-        return scale(side, over(unit(self.normal), position))
+        side = jnp.where((self._height_above_middle(t, position) < 0) != self.inside, -1.0, 1.0)
+        return scale(side, broadcast_vector(unit(self.normal), position))
 
     def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
         """The face on the side where a lane is, as a plane: a fast lane cannot mistake it for the other."""
         if self.inside:
             return self  # whichever face it passes, it has left
-        about = {name: getattr(self, name) for name in ABOUT}
-        normal = self.outward(t, position)
-        return Plane(over(self.point, position) + scale(self.thickness / 2, normal), normal, **about)
+        inherited = {name: getattr(self, name) for name in INHERITED_FIELDS}
+        normal = self.normal_at(t, position)
+        return Plane(broadcast_vector(self.point, position) + scale(self.thickness / 2, normal), normal, **inherited)
 
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
         """Where a segment crosses the middle of the slab."""
-        h0, h1 = self._above(t, start), self._above(t, end)
+        h0, h1 = self._height_above_middle(t, start), self._height_above_middle(t, end)
         crosses = h0 * h1 < 0
         return () if self.inside else (jnp.where(crosses, h0 / jnp.where(crosses, h0 - h1, 1.0), 0.0),)
 
-    def _above(self, t, position):
-        return self._height(t, position, over(unit(self.normal), position))
+    def _height_above_middle(self, t, position):
+        return self._height(t, position, broadcast_vector(unit(self.normal), position))
 
 
 class Sphere(Surface):
     """A ball in the way, or with `inside=True` a bowl that keeps what it holds.
 
     Example:
-        >>> float(contacts.Sphere(center=(0.0, 0.0), radius=4.0).gap(0.0, ball.position))
+        >>> float(contacts.Sphere(center=(0.0, 0.0), radius=4.0).signed_distance(0.0, ball.position))
         6.0
     """
 
@@ -111,17 +111,17 @@ class Sphere(Surface):
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
     inside: bool = eqx.field(static=True, default=False)
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the sphere [m]."""
         distance = norm(self._offset(t, position))
         return self.radius - distance if self.inside else distance - self.radius
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """Away from the center, or towards it where the inside is legal; zero in the center itself."""
         direction = unit(self._offset(t, position))
         return -direction if self.inside else direction
 
-    def bend(self, t: ArrayLike, position: Array, relative: Array) -> Array:
+    def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """|v_t|²/r, r from the center: along the surface a path bends away from the ball, or into the bowl."""
         offset = self._offset(t, position)
         distance, across = norm(offset), dot(relative, relative) - dot(relative, unit(offset)) ** 2
@@ -138,7 +138,7 @@ class Sphere(Surface):
         bow = norm(scale(dt, self.relative(start.velocity)) - chord) + norm(
             scale(dt, self.relative(end.velocity)) - chord
         )
-        s = jnp.clip(-dot(p, chord) / jnp.maximum(dot(chord, chord), _TINY), 0.0, 1.0)
+        s = jnp.clip(-dot(p, chord) / jnp.maximum(dot(chord, chord), _SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
         nearest = p + scale(s, chord)
         # a lane that leaves the surface is nearest at its start
         return dips | ((norm(nearest) < self.radius + bow / 4) & (s > 0))
@@ -152,7 +152,7 @@ class Sphere(Surface):
         chord = q - p
         b, a = 3.0 * chord - 2.0 * u - w, u + w - 2.0 * chord
         length = dot(chord, chord)
-        s = jnp.clip(-dot(p, chord) / jnp.maximum(length, _TINY), 0.0, 1.0)
+        s = jnp.clip(-dot(p, chord) / jnp.maximum(length, _SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
         at = p + scale(s, u + scale(s, b + scale(s, a)))
         slope, turn = u + scale(s, 2.0 * b + scale(3.0 * s, a)), 2.0 * b + scale(6.0 * s, a)
         steep = dot(slope, slope) + dot(at, turn)
@@ -163,10 +163,10 @@ class Sphere(Surface):
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
         """The foot of the perpendicular from the center."""
         p, along = self._offset(t, start), end - start
-        return (jnp.clip(-dot(p, along) / jnp.maximum(dot(along, along), _TINY), 0.0, 1.0),)
+        return (jnp.clip(-dot(p, along) / jnp.maximum(dot(along, along), _SMALLEST_LENGTH_SQUARED), 0.0, 1.0),)
 
     def _offset(self, t, position):
-        return self._still(t, position) - over(self.center, position)
+        return self._to_rest_frame(t, position) - broadcast_vector(self.center, position)
 
 
 class Room(Surface):
@@ -176,7 +176,7 @@ class Room(Surface):
     it ends outside: take steps in which no lane flies up from the floor, touches the ceiling and comes back.
 
     Example:
-        >>> float(contacts.Room((-4.0, 0.0), (7.0, 12.0)).gap(0.0, ball.position))
+        >>> float(contacts.Room((-4.0, 0.0), (7.0, 12.0)).signed_distance(0.0, ball.position))
         2.0
     """
 
@@ -185,9 +185,11 @@ class Room(Surface):
     upper: Float[Array, "..."] = quantity("upper corner", "m", kind="place")
 
     def __check_init__(self):
-        lower, upper = concrete(self.lower), concrete(self.upper)
+        lower, upper = concrete_or_none(self.lower), concrete_or_none(self.upper)
         if lower is not None and upper is not None:
-            demand("upper corner [m]", self.upper, upper > lower, f"above the lower corner {lower} in every component")
+            demand_all(
+                "upper corner [m]", self.upper, upper > lower, f"above the lower corner {lower} in every component"
+            )
 
     def relations(self) -> tuple[Array, ...]:
         """What must hold between its numbers, also where they are traced."""
@@ -195,27 +197,27 @@ class Room(Surface):
 
     def walls(self) -> tuple[Slab, ...]:
         """A corridor along each axis, between two opposite walls."""
-        about = {name: getattr(self, name) for name in ABOUT}
+        inherited = {name: getattr(self, name) for name in INHERITED_FIELDS}
         middle, width = (self.lower + self.upper) / 2, self.upper - self.lower
         axes = jnp.eye(self.lower.shape[-1], dtype=self.lower.dtype)
-        pairs = [Slab(middle, axis, width[..., i], inside=True, **about) for i, axis in enumerate(axes)]
+        pairs = [Slab(middle, axis, width[..., i], inside=True, **inherited) for i, axis in enumerate(axes)]
         if self.touching_since is None:
             return tuple(pairs)
-        return tuple(pair.remembering([self.touching_since[..., i]]) for i, pair in enumerate(pairs))
+        return tuple(pair.remember_since([self.touching_since[..., i]]) for i, pair in enumerate(pairs))
 
-    def remembering(self, since: list[Array]) -> "Room":
+    def remember_since(self, since: list[Array]) -> "Room":
         """The room with another memory of when each lane began to touch a wall, the wall's axis last."""
-        return super().remembering([jnp.stack(since, axis=-1)])
+        return super().remember_since([jnp.stack(since, axis=-1)])
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearest wall [m]; outside, to the farthest one that was passed."""
-        gaps = [wall.gap(t, position) for wall in self.walls()]
+        gaps = [wall.signed_distance(t, position) for wall in self.walls()]
         return jnp.min(jnp.stack(gaps), axis=0)
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """The normal of the nearest wall."""
-        nearest = jnp.argmin(jnp.stack([wall.gap(t, position) for wall in self.walls()]), axis=0)
-        normals = [wall.outward(t, position) for wall in self.walls()]
+        nearest = jnp.argmin(jnp.stack([wall.signed_distance(t, position) for wall in self.walls()]), axis=0)
+        normals = [wall.normal_at(t, position) for wall in self.walls()]
         return sum(scale((nearest == i).astype(position.dtype), n) for i, n in enumerate(normals))
 
     def may_meet(

@@ -12,14 +12,14 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import declared, quantity
+from physjax.checks import quantity, unchecked_quantity
 from physjax.particles import Particles
 from physjax.parts import Contact
-from physjax.physics.contacts.path_search import lowest_on_path, reach
-from physjax.physics.contacts.restitution import Coulomb, rebound
+from physjax.physics.contacts.path_search import bound_path_length, find_path_dip
+from physjax.physics.contacts.restitution import Coulomb, apply_restitution
 from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import project
-from physjax.vectors import dot, norm, over, scale, unit
+from physjax.vectors import broadcast_vector, dot, norm, scale, unit
 
 
 class Surface(Contact):
@@ -47,7 +47,7 @@ class Surface(Contact):
         "surface velocity", "m/s", kind="vector", default=None, kw_only=True
     )
     response: Callable | None = eqx.field(static=True, default=None, kw_only=True)
-    touching_since: Float[Array, "..."] | None = declared(
+    touching_since: Float[Array, "..."] | None = unchecked_quantity(
         "begin of contact", "s", per="memory", default=None, kw_only=True
     )
 
@@ -63,46 +63,46 @@ class Surface(Contact):
         return ("touching_since",) if self.response is impact else ()
 
     @abstractmethod
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Signed distance to the surface [m], > 0 on the legal side."""
 
-    def outward(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+    def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """Unit vector towards the legal side: unless a shape says it, the direction in which its gap grows."""
-        return unit(jax.grad(lambda x: jnp.sum(self.gap(t, x)))(position))
+        return unit(jax.grad(lambda x: jnp.sum(self.signed_distance(t, x)))(position))
 
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after a touch: back on the surface, v' = (1 - K_f) v_t - K_r v_n for a lane that was going in.
 
         Velocities are relative to a moving surface.
         """
-        gap, normal, relative = (
-            self.gap(t, state.position),
-            self.outward(t, state.position),
+        signed_distance, normal, relative = (
+            self.signed_distance(t, state.position),
+            self.normal_at(t, state.position),
             self.relative(state.velocity),
         )
-        inward = jnp.where(gap < 0, jnp.minimum(dot(relative, normal), 0.0), 0.0)
-        return rebound(self, state, (jnp.minimum(gap, 0.0), normal, relative), inward)
+        inward = jnp.where(signed_distance < 0, jnp.minimum(dot(relative, normal), 0.0), 0.0)
+        return apply_restitution(self, state, (jnp.minimum(signed_distance, 0.0), normal, relative), inward)
 
     def relative(self, velocity: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """Velocities as seen from the surface [m/s]."""
-        return velocity if self.velocity is None else velocity - over(self.velocity, velocity)
+        return velocity if self.velocity is None else velocity - broadcast_vector(self.velocity, velocity)
 
-    def bend(self, t: ArrayLike, position: Array, relative: Array) -> Array:
+    def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """What the surface's curvature adds to the second time derivative of the gap [m/s²]: nothing where it is flat."""
         if not self.curved:
             return jnp.zeros_like(relative[..., 0])
         return dot(relative, self.normal_rate(t, position, relative))
 
     def normal_rate(self, t: ArrayLike, position: Array, relative: Array) -> Array:
-        """How fast the normal turns under a lane that moves over the surface [1/s], from `outward` by differentiation."""
-        return jax.jvp(lambda x: self.outward(t, x), (position,), (relative,))[1]
+        """How fast the normal turns under a lane that moves over the surface [1/s], from `normal_at` by differentiation."""
+        return jax.jvp(lambda x: self.normal_at(t, x), (position,), (relative,))[1]
 
     def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
         """Where in a step the path comes lowest, as a share of it, and its gap there; `dip` is what the gap's cubic says.
 
         Where the surface is curved the path is followed, by the distance that it has to go at least.
         """
-        return lowest_on_path(self, t, dt, start, end, dip) if self.curved else dip
+        return find_path_dip(self, t, dt, start, end, dip) if self.curved else dip
 
     def may_meet(
         self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
@@ -119,14 +119,14 @@ class Surface(Contact):
         dips = self.may_dip_as_cubic(t, dt, start, end)
         if not self.curved:
             return dips
-        free = self.gap(t, start.position) + self.gap(t + dt, end.position)
-        return dips | (free < reach(self, dt, start, end))
+        free = self.signed_distance(t, start.position) + self.signed_distance(t + dt, end.position)
+        return dips | (free < bound_path_length(self, dt, start, end))
 
     def may_dip_as_cubic(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
         """The same of a gap that is a cubic in time, which stays above the lowest of its four control points."""
-        d0, d1 = self.gap(t, start.position), self.gap(t + dt, end.position)
-        r0 = dt * dot(self.relative(start.velocity), self.outward(t, start.position))
-        r1 = dt * dot(self.relative(end.velocity), self.outward(t + dt, end.position))
+        d0, d1 = self.signed_distance(t, start.position), self.signed_distance(t + dt, end.position)
+        r0 = dt * dot(self.relative(start.velocity), self.normal_at(t, start.position))
+        r1 = dt * dot(self.relative(end.velocity), self.normal_at(t + dt, end.position))
         return jnp.minimum(jnp.minimum(d0 + r0 / 3, d1 - r1 / 3), d1) < 0
 
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
@@ -141,7 +141,7 @@ class Surface(Contact):
         """The surfaces it is made of: itself."""
         return (self,)
 
-    def prepared(self, state: Particles, couples: bool) -> "Surface":
+    def prepare(self, state: Particles, couples: bool) -> "Surface":
         """The surface as part of a scene: which response it has, and, for `impact`, which lanes touch it from the start."""
         response = self.response or (project if couples else impact)
         if response is not impact:
@@ -151,28 +151,30 @@ class Surface(Contact):
                 f"{type(self).__name__}: got response=impact in a scene with forces that couple its lanes, expected "
                 "independent lanes: use response=contacts.project, or wrap a plain function in forces.independent."
             )
-        return replace(self, response=impact).remembering([_touching(wall, state) for wall in self.walls()])
+        return replace(self, response=impact).remember_since(
+            [_find_contact_start(wall, state) for wall in self.walls()]
+        )
 
-    def remembering(self, since: list[Array]) -> "Surface":
+    def remember_since(self, since: list[Array]) -> "Surface":
         """The surface with another memory of when each lane began to touch it, wall by wall."""
         return eqx.tree_at(lambda surface: surface.touching_since, self, since[0], is_leaf=lambda leaf: leaf is None)
 
-    def forgetting(self, lanes: Bool[Array, "*lanes"]) -> "Surface":
+    def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Surface":
         """The surface with some lanes as if they had never touched it."""
         if not self.memory:
             return self
-        return self.remembering([jnp.where(lanes, jnp.inf, wall.touching_since) for wall in self.walls()])
+        return self.remember_since([jnp.where(lanes, jnp.inf, wall.touching_since) for wall in self.walls()])
 
-    def _still(self, t: ArrayLike, position: Array) -> Array:
+    def _to_rest_frame(self, t: ArrayLike, position: Array) -> Array:
         """Positions as the surface sees them, which thinks that it stands where it was at t = 0."""
-        return position if self.velocity is None else position - scale(t, over(self.velocity, position))
+        return position if self.velocity is None else position - scale(t, broadcast_vector(self.velocity, position))
 
     def _height(self, t: ArrayLike, position: Array, normal: Array) -> Array:
         """How far positions are above the plane through the surface's point [m].
 
         Only the velocity along the normal moves a plane: a belt, which moves along itself, is where it was at any time.
         """
-        height = dot(position - over(self.point, position), normal)
+        height = dot(position - broadcast_vector(self.point, position), normal)
         if self.velocity is None:
             return height
         velocity, normal = jnp.broadcast_arrays(self.velocity, unit(self.normal))
@@ -183,16 +185,16 @@ class Surface(Contact):
         return height - t * along
 
 
-ABOUT = ("restitution", "friction", "coulomb", "velocity")
+INHERITED_FIELDS = ("restitution", "friction", "coulomb", "velocity")
 """What a part of a surface takes over from the whole."""
 
 
 @jax.jit  # one compilation instead of one for each operation
-def _touching(wall: Surface, state: Particles) -> Array:
+def _find_contact_start(wall: Surface, state: Particles) -> Array:
     """When each lane began to touch a surface: at t = 0 where it starts on it and does not leave, else never (infinite)."""
     (x, v), rounding = state, 8 * float(jnp.finfo(state.dtype).eps)
     relative = wall.relative(v)
-    normal_speed = dot(relative, wall.outward(0.0, x))
-    on = jnp.abs(wall.gap(0.0, x)) <= rounding * norm(x)
+    normal_speed = dot(relative, wall.normal_at(0.0, x))
+    on = jnp.abs(wall.signed_distance(0.0, x)) <= rounding * norm(x)
     along = normal_speed * normal_speed <= rounding**2 * dot(v, v)
     return lax.stop_gradient(jnp.where(on & along, 0.0, jnp.inf).astype(state.dtype))

@@ -16,22 +16,23 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
-from physjax.backend import any_lane, apart, on_flagged
-from physjax.loops import Time, now
+from physjax.backend import any_lane, compact_and_apply, materialise_where
+from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
-from physjax.physics.contacts.resting import Held, carried, hold, nothing_held
-from physjax.physics.contacts.restitution import rebound
-from physjax.roots import first_root
-from physjax.scene import Scene, traced_once
+from physjax.physics.contacts.events import Event, collect_faces, evaluate_guards, find_next_event
+from physjax.physics.contacts.resting import ContactMode, apply_contact_mode, decide_contact_mode, make_free_mode
+from physjax.physics.contacts.restitution import apply_restitution
+from physjax.roots import find_first_root
+from physjax.scene import Scene, trace_once
 from physjax.vectors import dot
 
-IMPACTS = 8
+MAX_IMPACTS = 8
 """Touches that one lane may have within one step; after so many it stays where it is, with its velocity, until the next."""
-SHORTEST_FLIGHT = 0.25
+SHORTEST_FLIGHT_SHARE = 0.25
 """A bounce whose flight would be shorter than this share of the step is the last: what would follow is summed."""
 
 
-@traced_once
+@trace_once
 def impact(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The response that finds when each lane touches within the step, bounces it there, and goes on from there.
 
@@ -48,32 +49,36 @@ def impact(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
         >>> print(end.position, end.velocity)
         [0.  0.5] [0. 1.]
     """
-    walls = _walls(scene)
+    walls = _collect_walls(scene)
     since = tuple(wall.touching_since for wall in walls)
     # a lane that is lost rests nowhere: the others must not take another path, in other roundings, because of it
-    anywhere = any_lane(jnp.any(jnp.isfinite(jnp.stack(since)), axis=0) & scene.finite(scene.state))
+    any_contact = any_lane(jnp.any(jnp.isfinite(jnp.stack(since)), axis=0) & scene.finite(scene.state))
     # a branch also keeps the step apart from what reads it: XLA would compute it again in every reader
     end, since = lax.cond(
-        anywhere,
-        lambda: _held_step(motion, scene, since, anywhere, t, dt),
+        any_contact,
+        lambda: _step_in_contact(motion, scene, since, any_contact, t, dt),
         lambda: (motion(scene, t, dt).state, since),
     )
-    meets = _may_meet(scene, since, end, now(t), dt)
+    meets = _may_meet(scene, since, end, to_float_time(t), dt)
     if scene.held is not None:
         meets = meets & ~scene.held
     others = (meets, scene, t, dt)
-    cut, masks = scene.may_be_cut(), scene.lane_mask(others)
-    end, since = on_flagged(partial(_through_touches, motion), meets, (end, since), *others, masks=masks, cut=cut)
-    return scene.having(state=end, contacts=_remembered(scene.contacts, list(since)))
+    cut, masks = scene.may_be_cut(), scene.build_lane_mask(others)
+    end, since = compact_and_apply(
+        partial(_step_through_contacts, motion), meets, (end, since), *others, masks=masks, cut=cut
+    )
+    return scene.replace(state=end, contacts=_store_contact_starts(scene.contacts, list(since)))
 
 
-def _held_step(
-    motion: Callable, scene: Scene, since: tuple, anywhere: Array, t: Time, dt: ArrayLike
+def _step_in_contact(
+    motion: Callable, scene: Scene, since: tuple, any_contact: Array, t: Time, dt: ArrayLike
 ) -> tuple[Particles, tuple]:
     """A step in which surfaces hold some lanes."""
-    walls = _walls(scene)
-    start = apart(anywhere, lambda: hold(scene, walls, since, t, dt), nothing_held(scene, walls, since))
-    return motion(carried(scene, walls, start), t, dt).state, start.since
+    walls = _collect_walls(scene)
+    start = materialise_where(
+        any_contact, lambda: decide_contact_mode(scene, walls, since, t, dt), make_free_mode(scene, walls, since)
+    )
+    return motion(apply_contact_mode(scene, walls, start), t, dt).state, start.since
 
 
 def _may_meet(scene: Scene, since: tuple, end: Particles, t: ArrayLike, dt: ArrayLike) -> Array:
@@ -87,7 +92,7 @@ def _may_meet(scene: Scene, since: tuple, end: Particles, t: ArrayLike, dt: Arra
     return jnp.any(jnp.stack(flags), axis=0)
 
 
-class _Leg(NamedTuple):
+class _StepProgress(NamedTuple):
     """How far each lane has come in a step: the time so far, its state, since when it touches what, whether it is through."""
 
     elapsed: Array
@@ -96,153 +101,166 @@ class _Leg(NamedTuple):
     arrived: Array
 
 
-def _through_touches(
+def _step_through_contacts(
     motion: Callable, changing: tuple[Particles, tuple], meets: Array, scene: Scene, t: Time, dt: ArrayLike
 ) -> tuple[Particles, tuple]:
     """The step again, leg by leg from touch to touch, of lanes that may meet something; the others are where they arrived."""
-    leg, dt = _beginning(scene, dt)
-    state, since = chosen(meets, (leg.state, leg.since), changing)
+    leg, dt = _start_progress(scene, dt)
+    state, since = choose_lanes(meets, (leg.state, leg.since), changing)
     leg = leg._replace(state=state, since=since, arrived=~meets)
 
     def go_on(leg, _):
         more = any_lane(~leg.arrived)
-        return lax.cond(more, lambda: chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt)), lambda: leg), None
+        return lax.cond(
+            more, lambda: choose_lanes(leg.arrived, leg, _advance_leg(motion, scene, leg, t, dt)), lambda: leg
+        ), None
 
-    leg, _ = lax.scan(go_on, leg, length=IMPACTS + 1)
-    return _waited(scene, leg, t, dt), leg.since
+    leg, _ = lax.scan(go_on, leg, length=MAX_IMPACTS + 1)
+    return _invalidate_overrun_lanes(scene, leg, t, dt), leg.since
 
 
-def _waited(scene: Scene, leg: _Leg, t: Time, dt: Array) -> Particles:
+def _invalidate_overrun_lanes(scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> Particles:
     """The lanes after a step; those that waited in it where a surface has moved over them are not finite any more."""
 
-    def lost():
-        begun = t + leg.elapsed
-        return ~leg.arrived & passed_over(
-            _faces(_walls(scene), now(begun), leg.state), now(begun), now(t + dt), leg.state
+    def overrun():
+        leg_start = t + leg.elapsed
+        return ~leg.arrived & is_overrun(
+            collect_faces(_collect_walls(scene), to_float_time(leg_start), leg.state),
+            to_float_time(leg_start),
+            to_float_time(t + dt),
+            leg.state,
         )
 
-    return without(apart(~leg.arrived, lost), leg.state)
+    return invalidate_lanes(materialise_where(~leg.arrived, overrun), leg.state)
 
 
-def passed_over(surfaces: list, begun: Array, ended: Array, state: Any) -> Bool[Array, "*lanes"]:
+def is_overrun(surfaces: list, leg_start: Array, ended: Array, state: Any) -> Bool[Array, "*lanes"]:
     """Whether a surface moves over a lane that stays where it is from one moment [s] to another."""
     x = lax.stop_gradient(state.position)
     rounding = 64 * float(jnp.finfo(x.dtype).eps) * jnp.sqrt(dot(x, x))
     over = jnp.zeros(rounding.shape, bool)
     for surface in surfaces:
-        before, after = (lax.stop_gradient(surface.clearance(t, state)) for t in (begun, ended))
+        before, after = (lax.stop_gradient(surface.clearance(t, state)) for t in (leg_start, ended))
         over = over | ((after < -rounding) & (after < before - rounding))
     return over
 
 
-def without(lost: Bool[Array, "*lanes"], state: Any) -> Any:
+def invalidate_lanes(overrun: Bool[Array, "*lanes"], state: Any) -> Any:
     """The state with NaN in the lanes that are lost: their status tells, and they harm no other."""
-    return jax.tree.map(lambda leaf: jnp.where(lost[..., None], jnp.nan, leaf), state)
+    return jax.tree.map(lambda leaf: jnp.where(overrun[..., None], jnp.nan, leaf), state)
 
 
-def _beginning(scene: Scene, dt: ArrayLike) -> tuple[_Leg, Array]:
+def _start_progress(scene: Scene, dt: ArrayLike) -> tuple[_StepProgress, Array]:
     """Where the first leg of a step begins, and the step of each lane."""
     dt = jnp.broadcast_to(dt, scene.state.lanes)
-    since = tuple(wall.touching_since for wall in _walls(scene))
-    return _Leg(jnp.zeros_like(dt), scene.state, since, jnp.zeros(dt.shape, bool)), dt
+    since = tuple(wall.touching_since for wall in _collect_walls(scene))
+    return _StepProgress(jnp.zeros_like(dt), scene.state, since, jnp.zeros(dt.shape, bool)), dt
 
 
-def _begun(scene: Scene, leg: _Leg, t: Time, dt: Array) -> tuple[Time, Array, Held]:
+def _begin_leg(scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> tuple[Time, Array, ContactMode]:
     """When a leg begins, how much of the step is left, and what carries each lane through it."""
-    walls, begun, rest = _walls(scene), t + leg.elapsed, jnp.maximum(dt - leg.elapsed, hair(dt))
-    here = scene.having(state=leg.state)
-    start = apart(~leg.arrived, lambda: hold(here, walls, leg.since, begun, rest), nothing_held(here, walls, leg.since))
-    return begun, rest, start
+    walls, leg_start, rest = (
+        _collect_walls(scene),
+        t + leg.elapsed,
+        jnp.maximum(dt - leg.elapsed, shortest_duration(dt)),
+    )
+    here = scene.replace(state=leg.state)
+    start = materialise_where(
+        ~leg.arrived,
+        lambda: decide_contact_mode(here, walls, leg.since, leg_start, rest),
+        make_free_mode(here, walls, leg.since),
+    )
+    return leg_start, rest, start
 
 
-def _leg(motion: Callable, scene: Scene, leg: _Leg, t: Time, dt: Array) -> _Leg:
+def _advance_leg(motion: Callable, scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> _StepProgress:
     """From where the lanes are to the first touch of each, or to the end of the step."""
-    walls, going = _walls(scene), ~leg.arrived
-    begun, rest, start = _begun(scene, leg, t, dt)
-    held = carried(scene, walls, start)
-    end = apart(going, lambda: motion(held, begun, rest).state, leg.state)
-    meeting = apart(going, lambda: _next_meeting(scene, start, end, now(begun), rest))
-    through = _Leg(leg.elapsed + rest, end, start.since, jnp.ones_like(leg.arrived))
+    walls, going = _collect_walls(scene), ~leg.arrived
+    leg_start, rest, start = _begin_leg(scene, leg, t, dt)
+    held = apply_contact_mode(scene, walls, start)
+    end = materialise_where(going, lambda: motion(held, leg_start, rest).state, leg.state)
+    event = materialise_where(going, lambda: find_next_event(walls, start, end, to_float_time(leg_start), rest))
+    through = _StepProgress(leg.elapsed + rest, end, start.since, jnp.ones_like(leg.arrived))
 
     def touch():
-        duration = jnp.maximum(_moment(motion, held, start, meeting, begun, rest), hair(dt))
-        touched = begun + duration
-        at = apart(meeting.hit, lambda: motion(held, begun, duration).state, leg.state)
-        state, since = apart(
-            meeting.hit, lambda: _answer(held, start, meeting, begun, touched, at, dt), (leg.state, leg.since)
+        duration = jnp.maximum(_find_event_time(motion, held, start, event, leg_start, rest), shortest_duration(dt))
+        touched = leg_start + duration
+        at = materialise_where(event.hit, lambda: motion(held, leg_start, duration).state, leg.state)
+        state, since = materialise_where(
+            event.hit, lambda: _resolve_contact(held, start, event, leg_start, touched, at, dt), (leg.state, leg.since)
         )
-        return chosen(meeting.hit, _Leg(leg.elapsed + duration, state, since, leg.arrived), through)
+        return choose_lanes(event.hit, _StepProgress(leg.elapsed + duration, state, since, leg.arrived), through)
 
-    return lax.cond(any_lane(meeting.hit), touch, lambda: through)
+    return lax.cond(any_lane(event.hit), touch, lambda: through)
 
 
 class Flight(NamedTuple):
     """A leg of a step, from one touch to the next, as it was flown.
 
     `before` is the state that the touch before it left, `scene` begins with what the surfaces made of that and carries
-    their reactions; `begun` [s] and `duration` [s] are of each lane; `end` is where the method came, `after` what the
-    touch there made of it. Lanes that are not `flying` had arrived before.
+    their reactions; `leg_start` [s] and `duration` [s] are of each lane; `end` is where the method came, `after` what the
+    touch there made of it. Lanes that are not `active` had arrived before.
     """
 
     before: Particles
     scene: Scene
-    begun: Time
+    leg_start: Time
     duration: Array
     end: Particles
     after: Particles
-    flying: Bool[Array, "*lanes"]
+    active: Bool[Array, "*lanes"]
 
 
-def flights(motion: Callable, scene: Scene, t: Time, dt: ArrayLike, add: Callable, total: Any) -> Any:
+def fold_flights(motion: Callable, scene: Scene, t: Time, dt: ArrayLike, add: Callable, total: Any) -> Any:
     """The legs of the step that `impact` takes, told one by one: `total = add(total, flight)`, folded over them.
 
     Returns the total and the state after the step.
     """
-    leg, dt = _beginning(scene, dt)
+    leg, dt = _start_progress(scene, dt)
 
     def fly(leg, total):
-        begun, _, start = _begun(scene, leg, t, dt)
-        held = carried(scene, _walls(scene), start)
-        after = chosen(leg.arrived, leg, _leg(motion, scene, leg, t, dt))
-        duration = jnp.maximum(after.elapsed - leg.elapsed, hair(dt))
-        end = motion(held, begun, duration).state
-        return after, add(total, Flight(leg.state, held, begun, duration, end, after.state, ~leg.arrived))
+        leg_start, _, start = _begin_leg(scene, leg, t, dt)
+        held = apply_contact_mode(scene, _collect_walls(scene), start)
+        after = choose_lanes(leg.arrived, leg, _advance_leg(motion, scene, leg, t, dt))
+        duration = jnp.maximum(after.elapsed - leg.elapsed, shortest_duration(dt))
+        end = motion(held, leg_start, duration).state
+        return after, add(total, Flight(leg.state, held, leg_start, duration, end, after.state, ~leg.arrived))
 
     def go_on(carry, _):
         return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
 
-    (leg, total), _ = lax.scan(go_on, (leg, total), length=IMPACTS + 1)
-    return total, _waited(scene, leg, t, dt)
+    (leg, total), _ = lax.scan(go_on, (leg, total), length=MAX_IMPACTS + 1)
+    return total, _invalidate_overrun_lanes(scene, leg, t, dt)
 
 
-def hair(dt: Array) -> Array:
+def shortest_duration(dt: Array) -> Array:
     """The shortest stretch of time: none is quite zero, so that a mean over it is still a mean."""
     return float(jnp.finfo(dt.dtype).eps) * dt
 
 
-def _answer(
-    scene: Scene, start: Held, meeting: "_Meeting", begun: Time, t: Time, at: Particles, dt: Array
+def _resolve_contact(
+    scene: Scene, start: ContactMode, event: "Event", leg_start: Time, t: Time, at: Particles, dt: Array
 ) -> tuple[Particles, tuple]:
     """State and memory after the touches: a bounce, coming to rest, or the end of a slide."""
-    walls, acceleration, t = _walls(scene), scene.acceleration(t, at), now(t)
-    faces = _faces(walls, now(begun), start.state)
-    guards = jnp.stack(_guards(faces, walls, start, meeting, t, at))
+    walls, acceleration, t = _collect_walls(scene), scene.acceleration(t, at), to_float_time(t)
+    faces = collect_faces(walls, to_float_time(leg_start), start.state)
+    guards = jnp.stack(evaluate_guards(faces, walls, start, event, t, at))
     which = jnp.argmin(guards, axis=0)
     # a path that only just misses, though the cubic touched, goes on as it was
     eps = float(jnp.finfo(at.dtype).eps)
-    reached = 64 * eps * jnp.sqrt(dot(at.position, at.position)) + eps**0.5 * (meeting.above - meeting.below)
-    touches = meeting.hit & (jnp.min(guards, axis=0) <= lax.stop_gradient(reached))
+    reached = 64 * eps * jnp.sqrt(dot(at.position, at.position)) + eps**0.5 * (event.above - event.below)
+    touches = event.hit & (jnp.min(guards, axis=0) <= lax.stop_gradient(reached))
     state, since = at, list(start.since)
     # one guard a lane: each answer starts from the same state, and is taken where it applies
     for i, wall in enumerate(faces):
         here = touches & (which == i)
-        normal, relative = wall.outward(t, at.position), wall.relative(at.velocity)
+        normal, relative = wall.normal_at(t, at.position), wall.relative(at.velocity)
         inward = jnp.where(here, jnp.minimum(dot(relative, normal), 0.0), 0.0)
         lift = wall.restitution * -inward
-        weight = -(dot(acceleration, normal) + wall.bend(t, at.position, relative))
-        rests = here & (2 * lift <= SHORTEST_FLIGHT * dt * weight) & ((wall.restitution < 1) | (lift == 0))
-        touch = (wall.gap(t, at.position), normal, relative)
-        state = chosen(here, rebound(wall, at, touch, inward, rests), state)
+        weight = -(dot(acceleration, normal) + wall.curvature_acceleration(t, at.position, relative))
+        rests = here & (2 * lift <= SHORTEST_FLIGHT_SHARE * dt * weight) & ((wall.restitution < 1) | (lift == 0))
+        touch = (wall.signed_distance(t, at.position), normal, relative)
+        state = choose_lanes(here, apply_restitution(wall, at, touch, inward, rests), state)
         flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - wall.restitution), 1.0)
         since[i] = jnp.where(rests, t + flights, since[i])
     slides = [i for i, slip in enumerate(start.slip) if slip is not None]
@@ -250,134 +268,56 @@ def _answer(
         relative, before = walls[i].relative(at.velocity), walls[i].relative(start.state.velocity)
         slowed = dot(relative, relative) < 0.25 * dot(before, before)  # else it only turned
         stopped = Particles(at.position, at.velocity - relative)
-        state = chosen(touches & (which == guard) & slowed, stopped, state)
-    bounced, kick = touches & (which < len(walls)), dot(acceleration, acceleration) * (dt * dt)
+        state = choose_lanes(touches & (which == guard) & slowed, stopped, state)
+    bounced, load_speed_squared = touches & (which < len(walls)), dot(acceleration, acceleration) * (dt * dt)
     for i, wall in enumerate(walls):
         # a bounce elsewhere throws a lane off what it touched, or into it: then that is a new touch
-        since[i] = jnp.where(bounced & (which != i) & _leaves(wall, t, state, kick), jnp.inf, since[i])
+        since[i] = jnp.where(
+            bounced & (which != i) & _is_leaving(wall, t, state, load_speed_squared), jnp.inf, since[i]
+        )
     return state, tuple(since)
 
 
-class _Meeting(NamedTuple):
-    """Which lanes meet something within a leg, and between which shares of it; how far above and below zero its guard is.
+def _find_event_time(
+    motion: Callable, scene: Scene, start: ContactMode, event: Event, leg_start: Time, rest: Array
+) -> Array:
+    """When the first guard reaches zero on the method's own path [s after `leg_start`]; differentiable."""
+    event, rest = lax.stop_gradient((event, rest))
 
-    A guard is a number that is positive until something happens: the gap to a surface, or the speed of a slide along
-    the direction it had. `watched` says which guards may end the leg; the others are not looked at.
-    """
+    def nearest(duration, scene, start, event, leg_start):
+        state, walls = motion(scene, leg_start, duration).state, _collect_walls(scene)
+        faces = collect_faces(walls, to_float_time(leg_start), start.state)
+        return jnp.min(
+            jnp.stack(evaluate_guards(faces, walls, start, event, to_float_time(leg_start + duration), state)), axis=0
+        )
 
-    hit: Bool[Array, "*lanes"]
-    first: Array
-    last: Array
-    above: Array
-    below: Array
-    watched: tuple[Array, ...]
-
-
-def _next_meeting(scene: Scene, start: Held, end: Particles, t: ArrayLike, dt: ArrayLike) -> _Meeting:
-    """What the path from start to end meets, judged by the cubic through its ends; few operations, since every lane pays."""
-    scene, start, end = lax.stop_gradient((scene, start, end))
-    walls, dips = _walls(scene), []
-    for face, pressed in zip(_faces(walls, t, start.state), start.pressed, strict=True):
-        dip = dip_of(face, t, dt, start.state, end)
-        dips.append(dip._replace(last=jnp.where(pressed > 0, jnp.inf, dip.last)))
-    for wall, slip in zip(walls, start.slip, strict=True):
-        if slip is not None:
-            before, after = (dot(wall.relative(state.velocity), slip) for state in (start.state, end))
-            last = jnp.where((before > 0) & (after <= 0), 1.0, jnp.inf)
-            dips.append(Dip(jnp.zeros_like(last), last, before, after))
-    last = jnp.min(jnp.stack([dip.last for dip in dips]), axis=0)
-    first = jnp.min(jnp.stack([jnp.where(dip.last <= 1, dip.first, jnp.inf) for dip in dips]), axis=0)
-    above, below = jnp.zeros_like(last), jnp.zeros_like(last)
-    for dip in dips:
-        above = jnp.where(dip.last == last, dip.above, above)
-        below = jnp.where(dip.last == last, dip.below, below)
-    return _Meeting(last <= 1, first, last, above, below, tuple(dip.last <= 1 for dip in dips))
-
-
-class Dip(NamedTuple):
-    """Where a gap goes below zero within a leg: after the share `first`, before `last` (infinite: nowhere), and how deep."""
-
-    first: Array
-    last: Array
-    above: Array
-    below: Array
-
-
-def dip_of(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Dip:
-    """The first dip of the gap, as the cubic d(s) = d₀ + r s + b s² + a s³ through the ends of the leg has it."""
-    d0, d1 = face.gap(t, start.position), face.gap(t + dt, end.position)
-    r0 = dt * dot(face.relative(start.velocity), face.outward(t, start.position))
-    r1 = dt * dot(face.relative(end.velocity), face.outward(t + dt, end.position))
-    b, a = 3 * (d1 - d0) - 2 * r0 - r1, r0 + r1 - 2 * (d1 - d0)
-    cubic = lambda s: d0 + s * (r0 + s * (b + s * a))  # noqa: E731
-    root = jnp.sqrt(jnp.maximum(b * b - 3 * a * r0, 0.0))
-    # the quotient that does not cancel; where its denominator is zero the value is infinite and not taken
-    lowest = jnp.where(b > 0, -r0 / (b + root), (root - b) / (3 * a))
-    highest = jnp.where(b < 0, r0 / (root - b), -(root + b) / (3 * a))
-    lowest, depth = face.deepest(t, dt, start, end, (lowest, cubic(lowest)))
-    last = jnp.where(d1 < 0, 1.0, jnp.inf)
-    last = jnp.where((lowest > 0) & (lowest < 1) & (depth < 0), lowest, last)
-    last = jnp.where((d0 < 0) & (r0 < 0), 0.0, last)
-    # a lane that just bounced is at zero now as well; behind a part of its way up only the next touch is left
-    bounced = (d0 <= float(jnp.finfo(d0.dtype).eps) ** 0.5 * r0) & (r0 > 0) & (highest > 0) & (highest < last)
-    first = jnp.where(bounced, 0.1 * highest, 0.0)
-    below = jnp.where(last == 1.0, d1, depth)
-    return Dip(first, last, jnp.where(first > 0, cubic(first), d0), below)
-
-
-def _guards(faces: list, walls: tuple, start: Held, meeting: _Meeting, t: ArrayLike, state: Particles) -> list[Array]:
-    """The guards of a leg at a moment; those not watched are infinite. The faces are those seen when the leg begins.
-
-    Later a slab that moves may have gone past the place where the lane began.
-    """
-    values = [face.gap(t, state.position) for face in faces]
-    for wall, slip in zip(walls, start.slip, strict=True):
-        if slip is not None:
-            values.append(dot(wall.relative(state.velocity), slip))
-    return [jnp.where(seen, value, jnp.inf) for seen, value in zip(meeting.watched, values, strict=True)]
-
-
-def _moment(motion: Callable, scene: Scene, start: Held, meeting: _Meeting, begun: Time, rest: Array) -> Array:
-    """When the first guard reaches zero on the method's own path [s after `begun`]; differentiable."""
-    meeting, rest = lax.stop_gradient((meeting, rest))
-
-    def nearest(duration, scene, start, meeting, begun):
-        state, walls = motion(scene, begun, duration).state, _walls(scene)
-        faces = _faces(walls, now(begun), start.state)
-        return jnp.min(jnp.stack(_guards(faces, walls, start, meeting, now(begun + duration), state)), axis=0)
-
-    bracket = (meeting.first * rest, jnp.minimum(meeting.last, 1.0) * rest)
+    bracket = (event.first * rest, jnp.minimum(event.last, 1.0) * rest)
     tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest
-    search = (bracket, (meeting.above, meeting.below), meeting.hit, tolerance)
-    return first_root(nearest, (scene, start, meeting, begun), search)
+    search = (bracket, (event.above, event.below), event.hit, tolerance)
+    return find_first_root(nearest, (scene, start, event, leg_start), search)
 
 
-def _walls(scene: Scene) -> tuple:
+def _collect_walls(scene: Scene) -> tuple:
     """The surfaces that answer at the moment of impact, rooms taken apart."""
     return tuple(wall for contact in scene.contacts if contact.response is impact for wall in contact.walls())
 
 
-def _faces(walls: tuple, t: ArrayLike, state: Particles) -> list:
-    """The surfaces as each lane sees them from where it is: of a slab, the nearer face."""
-    return [wall.facing(t, state.position) for wall in walls]
-
-
-def _leaves(wall: eqx.Module, t: ArrayLike, state: Particles, kick: Array) -> Array:
-    """Whether a lane is moving off a surface, or into it, by more than rounding of its speed and of a step's `kick`²."""
+def _is_leaving(wall: eqx.Module, t: ArrayLike, state: Particles, load_speed_squared: Array) -> Array:
+    """Whether a lane is moving off a surface, or into it, by more than rounding of its speed and of a step's `load_speed_squared`²."""
     relative, eps = wall.relative(state.velocity), float(jnp.finfo(state.dtype).eps)
-    normal_speed = dot(relative, wall.outward(t, state.position))
-    return normal_speed * normal_speed > eps * dot(relative, relative) + (16 * eps) ** 2 * kick
+    normal_speed = dot(relative, wall.normal_at(t, state.position))
+    return normal_speed * normal_speed > eps * dot(relative, relative) + (16 * eps) ** 2 * load_speed_squared
 
 
-def _remembered(contacts: tuple, since: list) -> tuple:
+def _store_contact_starts(contacts: tuple, since: list) -> tuple:
     """The contacts with their memory of who touches them."""
     return tuple(
-        contact.remembering([since.pop(0) for _ in contact.walls()]) if contact.response is impact else contact
+        contact.remember_since([since.pop(0) for _ in contact.walls()]) if contact.response is impact else contact
         for contact in contacts
     )
 
 
-def chosen(flag: Array, a: Any, b: Any) -> Any:
+def choose_lanes(flag: Array, a: Any, b: Any) -> Any:
     """Lane by lane a where flagged, else b, for trees of numbers and vectors."""
     pick = lambda x, y: jnp.where(flag if x.ndim == flag.ndim else flag[..., None], x, y)  # noqa: E731
     return jax.tree.map(pick, a, b)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, quantity
+from physjax.checks import concrete_or_none, demand_all, quantity
 
 
 class Appearance(NamedTuple):
@@ -48,18 +48,18 @@ class Look(eqx.Module):
                 raise ValueError(
                     f"{name} over life: got the shape {curve.shape}, expected {'(knots, 3)' if axes == 2 else '(knots,)'}."
                 )
-            if name != "size" and concrete(curve) is not None:
-                demand(f"{name} over life [1]", curve, concrete(curve) <= 1, "numbers from 0 to 1")
+            if name != "size" and concrete_or_none(curve) is not None:
+                demand_all(f"{name} over life [1]", curve, concrete_or_none(curve) <= 1, "numbers from 0 to 1")
 
-    def seen(
+    def appearance_of(
         self, alive: Bool[Array, "*lanes"], size: Float[Array, "*lanes"], share: Float[Array, "*lanes"]
     ) -> Appearance:
         """The appearance of particles born with a size [m], after a share of their lives."""
-        colour = jnp.stack([_along(self.colour[:, i], share) for i in range(3)], axis=-1)
-        opacity = jnp.where(alive, _along(self.opacity, share), 0.0)
-        return Appearance(alive, size * _along(self.size, share), colour, opacity)
+        colour = jnp.stack([_interpolate(self.colour[:, i], share) for i in range(3)], axis=-1)
+        opacity = jnp.where(alive, _interpolate(self.opacity, share), 0.0)
+        return Appearance(alive, size * _interpolate(self.size, share), colour, opacity)
 
 
-def _along(curve: Array, share: Array) -> Array:
+def _interpolate(curve: Array, share: Array) -> Array:
     knots = jnp.linspace(0.0, 1.0, curve.shape[0], dtype=share.dtype)
     return jnp.interp(share, knots, curve.astype(share.dtype))

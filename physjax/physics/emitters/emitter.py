@@ -16,15 +16,33 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from physjax.backend import kept_apart, on_runs
-from physjax.checks import concrete, declared, demand, demand_direction, positive_integer, quantity
-from physjax.loops import NUDGE, Moment, Time, exact_multiple, exact_quotient, exact_sum, now, rest_in, rest_of, rounded
+from physjax.backend import compact_and_apply_runs, materialise
+from physjax.checks import (
+    as_positive_integer,
+    concrete_or_none,
+    demand_all,
+    demand_direction,
+    quantity,
+    unchecked_quantity,
+)
+from physjax.loops import (
+    LARGEST_SNAP_SHARE,
+    Moment,
+    Time,
+    cast_remainder,
+    exact_multiple,
+    exact_quotient,
+    exact_sum,
+    float32_remainder,
+    force_rounding,
+    to_float_time,
+)
 from physjax.particles import Particles, demand_particles
 from physjax.physics.emitters.appearance import Appearance, Look
-from physjax.physics.emitters.shapes import Source, direction_of, in_cone
-from physjax.vectors import components, over, scale, stacked
+from physjax.physics.emitters.shapes import Source, direction_in_cone, unit_direction
+from physjax.vectors import broadcast_vector, components, scale, stack_components
 
-_DRAWS = 8
+_DRAWS_PER_BIRTH = 8
 """Uniform numbers of a birth: three for the place, two for the direction, then speed, life and size."""
 
 
@@ -68,9 +86,11 @@ class Emitter(eqx.Module):
 
     memory: ClassVar[tuple[str, ...]] = ("generation", "born", "born_rest", "dies", "dies_rest")
 
-    pool: int = eqx.field(static=True, converter=lambda value: positive_integer("pool", value))
+    pool: int = eqx.field(static=True, converter=lambda value: as_positive_integer("pool", value))
     source: Source
-    key: UInt32[Array, "words"] = declared("key", per=None, converter=lambda key: _key_data(key), kw_only=True)
+    key: UInt32[Array, "words"] = unchecked_quantity(
+        "key", per=None, converter=lambda key: _read_key(key), kw_only=True
+    )
     life: Float[Array, ""] = quantity("life", "s", per=None, above=0, kw_only=True)
     speed: Float[Array, ""] = quantity("speed", "m/s", per=None, default=0.0, kw_only=True)
     rate: Float[Array, ""] | None = quantity("rate", "1/s", per=None, above=0, default=None, kw_only=True)
@@ -92,24 +112,24 @@ class Emitter(eqx.Module):
     look: Look = eqx.field(default_factory=Look, kw_only=True)
     opposed: bool = eqx.field(static=True, default=False, kw_only=True)
     drop_oldest: bool = eqx.field(static=True, default=False, kw_only=True)
-    slot: Int[Array, "pool"] | None = declared("slot", per="memory", default=None, kw_only=True)
-    generation: Int[Array, "..."] | None = declared("generation", per="memory", default=None, kw_only=True)
-    born: Float[Array, "..."] | None = declared("birth", "s", per="memory", default=None, kw_only=True)
-    dies: Float[Array, "..."] | None = declared("death", "s", per="memory", default=None, kw_only=True)
-    start_rest: Float[Array, "..."] | None = declared(
+    slot: Int[Array, "pool"] | None = unchecked_quantity("slot", per="memory", default=None, kw_only=True)
+    generation: Int[Array, "..."] | None = unchecked_quantity("generation", per="memory", default=None, kw_only=True)
+    born: Float[Array, "..."] | None = unchecked_quantity("birth", "s", per="memory", default=None, kw_only=True)
+    dies: Float[Array, "..."] | None = unchecked_quantity("death", "s", per="memory", default=None, kw_only=True)
+    start_rest: Float[Array, "..."] | None = unchecked_quantity(
         "rest of the start", "s", per=None, default=None, repr=False, kw_only=True
     )
-    born_rest: Float[Array, "..."] | None = declared(
+    born_rest: Float[Array, "..."] | None = unchecked_quantity(
         "rest of birth", "s", per="memory", default=None, repr=False, kw_only=True
     )
-    dies_rest: Float[Array, "..."] | None = declared(
+    dies_rest: Float[Array, "..."] | None = unchecked_quantity(
         "rest of death", "s", per="memory", default=None, repr=False, kw_only=True
     )
 
     def __post_init__(self):
         # an array of its own, so that lanes that are taken apart keep their numbers
         self.slot = jnp.arange(self.pool, dtype=jnp.int32)
-        self.start_rest = rest_of(self.start, self.start_rest)
+        self.start_rest = float32_remainder(self.start, self.start_rest)
 
     def __check_init__(self):
         if self.rate is not None and (self.every is not None or self.burst is not None):
@@ -117,13 +137,13 @@ class Emitter(eqx.Module):
         if self.burst is not None:
             if self.every is None:
                 raise ValueError("burst: got a number without every=, the time between bursts [s]. Give both.")
-            if self.pool % positive_integer("burst", self.burst):
+            if self.pool % as_positive_integer("burst", self.burst):
                 raise ValueError(f"burst: got {self.burst}, expected a divisor of the pool of {self.pool}.")
-        if self.opposed and self._burst % 2:
-            raise ValueError(f"opposed: got births {self._burst} at a time, expected bursts of an even number.")
+        if self.opposed and self._burst_size % 2:
+            raise ValueError(f"opposed: got births {self._burst_size} at a time, expected bursts of an even number.")
         for name, value in (("life", self.life_spread), ("size", self.size_spread)):
-            if concrete(value) is not None:
-                demand(f"spread of the {name} [1]", value, concrete(value) < 1, "numbers from 0 to below 1")
+            if concrete_or_none(value) is not None:
+                demand_all(f"spread of the {name} [1]", value, concrete_or_none(value) < 1, "numbers from 0 to below 1")
         if self.direction is not None:
             demand_direction("direction", self.direction)
         if not self.drop_oldest:
@@ -135,11 +155,11 @@ class Emitter(eqx.Module):
 
     def _demand_room(self):
         """Raise a ValueError where a slot is needed again before its particle has died."""
-        life, spread, pace = concrete(self.life), concrete(self.life_spread), self._pace
-        pace = None if pace is None else concrete(pace)
+        life, spread, pace = concrete_or_none(self.life), concrete_or_none(self.life_spread), self._mean_rate
+        pace = None if pace is None else concrete_or_none(pace)
         if life is None or spread is None or pace is None:
             return
-        longest, burst = float(np.max(life * (1 + spread))), self._burst
+        longest, burst = float(np.max(life * (1 + spread))), self._burst_size
         needed = burst * math.ceil(longest * float(np.max(pace)) / burst * (1 - 1e-6))
         if needed > self.pool:
             raise ValueError(
@@ -150,14 +170,14 @@ class Emitter(eqx.Module):
     # births, as a closed form
 
     @property
-    def _burst(self) -> int:
+    def _burst_size(self) -> int:
         """Particles that are born together."""
         return 1 if self.rate is not None else self.burst or self.pool
 
     @property
-    def _pace(self) -> Array | None:
+    def _mean_rate(self) -> Array | None:
         """Births a second on the long run; None where there is one burst only."""
-        return self.rate if self.every is None else self._burst / self.every
+        return self.rate if self.every is None else self._burst_size / self.every
 
     def birth_time(self, slot: Int[Array, "*births"], generation: Int[Array, "*births"]) -> Float[Array, "*births"]:
         """When the particle of a slot and generation is born [s]: start + n/rate, or its burst's moment."""
@@ -165,72 +185,72 @@ class Emitter(eqx.Module):
 
     def _birth_moment(self, slot: Array, generation: Array) -> tuple[Array, Array]:
         """When the particle of a slot and generation is born [s], and what rounding left out of that."""
-        start, start_rest = self.start, rest_in(self.start, self.start_rest)
-        if self._pace is None:
+        start, start_rest = self.start, cast_remainder(self.start, self.start_rest)
+        if self._mean_rate is None:
             return jnp.broadcast_to(start, generation.shape), jnp.broadcast_to(start_rest, generation.shape)
-        after, after_rest = self._after((generation * self.pool + slot) // self._burst)
+        after, after_rest = self._burst_delay((generation * self.pool + slot) // self._burst_size)
         time, rest = exact_sum(start, after)
         return time, rest + (start_rest + after_rest)
 
-    def _after(self, burst: Array) -> tuple[Array, Array]:
+    def _burst_delay(self, burst: Array) -> tuple[Array, Array]:
         """How long after the first a burst comes [s], and what rounding left out of that."""
         return exact_quotient(burst, self.rate) if self.every is None else exact_multiple(burst, self.every)
 
-    def due(self, t: Time) -> Int[Array, "pool"]:
+    def due_generation(self, t: Time) -> Int[Array, "pool"]:
         """The generation that each slot has been born in by a time [s]; -1 where it has not been born."""
-        bursts = self._bursts(Moment.of(t, jnp.inf, self.start.dtype))
-        last = (bursts + 1) * self._burst - 1
+        bursts = self._find_last_burst(Moment.of(t, jnp.inf, self.start.dtype))
+        last = (bursts + 1) * self._burst_size - 1
         rounds = last // self.pool
         begun = self.slot <= last - rounds * self.pool
         return rounds + begun.astype(jnp.int32) - 1
 
     @property
-    def _most(self) -> int:
+    def _last_countable_burst(self) -> int:
         """The number of the last burst whose births can be counted in 32 bits."""
-        return (2**31 - 2 * self.pool) // self._burst - 1
+        return (2**31 - 2 * self.pool) // self._burst_size - 1
 
-    def _bursts(self, t: Moment) -> Array:
+    def _find_last_burst(self, t: Moment) -> Array:
         """The number of the last burst by a time, -1 before the first; one that comes later by no more than rounding is it."""
         # kept apart, or XLA on CPU would count anew for every lane
-        return kept_apart(now(t), lambda: self._counted_bursts(t))
+        return materialise(to_float_time(t), lambda: self._count_bursts(t))
 
-    def _counted_bursts(self, t: Moment) -> Array:
-        whole, rest = t.since(self.start, rest_in(self.start, self.start_rest))
-        early = jnp.minimum(2 * float(jnp.finfo(whole.dtype).eps) * jnp.abs(t.start), NUDGE * t.step)
+    def _count_bursts(self, t: Moment) -> Array:
+        whole, rest = t.time_since(self.start, cast_remainder(self.start, self.start_rest))
+        early = jnp.minimum(2 * float(jnp.finfo(whole.dtype).eps) * jnp.abs(t.start), LARGEST_SNAP_SHARE * t.step)
         rest = rest + early
-        if self._pace is None:
+        if self._mean_rate is None:
             return jnp.where(whole + rest < 0, -1, 0).astype(jnp.int32)
-        pace = self._pace / self._burst
-        guess = jnp.clip(jnp.floor(whole * pace), -1, self._most).astype(jnp.int32)
-        after, after_rest = self._after(guess)
-        more = jnp.floor(((whole - rounded(after)) + (rest - after_rest)) * pace)
-        return jnp.clip(guess + jnp.clip(more, -1e6, 1e6).astype(jnp.int32), -1, self._most)
+        pace = self._mean_rate / self._burst_size
+        guess = jnp.clip(jnp.floor(whole * pace), -1, self._last_countable_burst).astype(jnp.int32)
+        after, after_rest = self._burst_delay(guess)
+        more = jnp.floor(((whole - force_rounding(after)) + (rest - after_rest)) * pace)
+        return jnp.clip(guess + jnp.clip(more, -1e6, 1e6).astype(jnp.int32), -1, self._last_countable_burst)
 
     @eqx.filter_jit  # as one program wherever it is called: one operation after the other would round otherwise
     def births(self, slot: Int[Array, "births"], generation: Int[Array, "births"]) -> Birth:
         """The births of these slots in these generations, drawn from the key folded with both."""
-        u = self._drawn(slot, generation)
+        u = self._draw(slot, generation)
         place, outward = self.source(u[:, :3])
-        axis = outward if self.direction is None else over(direction_of(self.direction), outward)
-        speed = _spread(self.speed, self.speed_spread, u[:, 5])
+        axis = outward if self.direction is None else broadcast_vector(unit_direction(self.direction), outward)
+        speed = _apply_spread(self.speed, self.speed_spread, u[:, 5])
         if self.opposed:
             speed = jnp.where(slot % 2 == 0, speed, -speed)
         return Birth(
             time=self.birth_time(slot, generation),
-            life=_spread(self.life, self.life_spread, u[:, 6]),
-            size=_spread(self.size, self.size_spread, u[:, 7]),
+            life=_apply_spread(self.life, self.life_spread, u[:, 6]),
+            size=_apply_spread(self.size, self.size_spread, u[:, 7]),
             position=place,
-            velocity=scale(speed, in_cone(axis, self.cone, u[:, 3:5])),
+            velocity=scale(speed, direction_in_cone(axis, self.cone, u[:, 3:5])),
         )
 
-    def _drawn(self, slot: Array, generation: Array) -> Array:
+    def _draw(self, slot: Array, generation: Array) -> Array:
         key = jax.random.wrap_key_data(self.key, impl="threefry2x32")
         # the second of a pair has the numbers of the first
         slot = slot - slot % 2 if self.opposed else slot
 
         def one(slot, generation):
             own = jax.random.fold_in(jax.random.fold_in(key, slot), generation)
-            return jax.random.uniform(own, (_DRAWS,), self.start.dtype)
+            return jax.random.uniform(own, (_DRAWS_PER_BIRTH,), self.start.dtype)
 
         return jax.vmap(one)(slot, generation)
 
@@ -242,7 +262,7 @@ class Emitter(eqx.Module):
         place = emitter.births(self.slot, jnp.zeros_like(self.slot)).position
         return Particles(place, jnp.zeros_like(place))
 
-    def prepared(self, scene: Any) -> "Emitter":
+    def prepare(self, scene: Any) -> "Emitter":
         """The emitter as part of a scene, its numbers in the state's type; its memory begins here. The checks are here."""
         state = scene.state
         demand_particles("emitter", state, "bodies are not born")
@@ -264,7 +284,7 @@ class Emitter(eqx.Module):
             # a lane that a traced number has spoilt is never born, or its birth would put it right
             spoilt = jnp.any(jnp.isnan(state.position), axis=-1)
             unborn = jnp.where(spoilt, jnp.iinfo(jnp.int32).max, unborn)
-        return self._cast(state.dtype)._remembering(unborn, never, nothing, -never, nothing)
+        return self._cast(state.dtype)._with_memory(unborn, never, nothing, -never, nothing)
 
     def live(self, motion: Callable, scene: Any, t: Time, dt: ArrayLike) -> Any:
         """One step of a scene in which particles are born and die inside it, each at its own moment.
@@ -274,59 +294,59 @@ class Emitter(eqx.Module):
         """
         t = Moment.of(t, dt, scene.state.dtype)
         emitter, state = self.emit(t + dt, scene.state)
-        if self._pace is not None:
-            dt = jnp.where(self._bursts(t + dt) < self._most, dt, jnp.nan)
-        born, dies = t.until(emitter.born, emitter.born_rest), t.until(emitter.dies, emitter.dies_rest)
+        if self._mean_rate is not None:
+            dt = jnp.where(self._find_last_burst(t + dt) < self._last_countable_burst, dt, jnp.nan)
+        born, dies = t.time_until(emitter.born, emitter.born_rest), t.time_until(emitter.dies, emitter.dies_rest)
         begun, end = jnp.clip(born, 0.0, dt), jnp.minimum(dies, dt)
         limits = jnp.finfo(state.dtype)
         shortest = float(limits.tiny) / float(limits.eps)
         lasts = jnp.where((born <= 0) & (dies >= dt), dt, jnp.maximum(end - begun, shortest))
         # the dead keep what they touched: who lies on a surface is not asked again whether it meets it
-        contacts = tuple(contact.forgetting(emitter.generation > self.generation) for contact in scene.contacts)
-        after = motion(scene.having(state=state, contacts=contacts, emitter=emitter), t + begun, lasts)
-        return after.having(state=after.state.held((dt < dies).astype(state.dtype)))
+        contacts = tuple(contact.forget_lanes(emitter.generation > self.generation) for contact in scene.contacts)
+        after = motion(scene.replace(state=state, contacts=contacts, emitter=emitter), t + begun, lasts)
+        return after.replace(state=after.state.hold_lanes((dt < dies).astype(state.dtype)))
 
     def emit(self, t: Time, state: Particles) -> tuple["Emitter", Particles]:
         """All that are born by the time t [s], put where they were born; only their numbers are drawn."""
-        due = jnp.maximum(self.due(t), self.generation)
+        due_generation = jnp.maximum(self.due_generation(t), self.generation)
 
-        def newborn(changing, slot, due):
-            return due > changing[1]
+        def newborn(changing, slot, due_generation):
+            return due_generation > changing[1]
 
-        def bear(changing, slot, due):
+        def bear(changing, slot, due_generation):
             (x, v), generation, *moments = changing
-            new, birth = due > generation, self.births(slot, due)
-            state = Particles(_chosen(new, birth.position, x), _chosen(new, birth.velocity, v))
-            time, rest = self._birth_moment(slot, due)
+            new, birth = due_generation > generation, self.births(slot, due_generation)
+            state = Particles(_choose_vectors(new, birth.position, x), _choose_vectors(new, birth.velocity, v))
+            time, rest = self._birth_moment(slot, due_generation)
             ends, more = exact_sum(time, birth.life)
             fresh = (time, rest, ends, rest + more)
-            return state, due, *(jnp.where(new, a, b) for a, b in zip(fresh, moments, strict=True))
+            return state, due_generation, *(jnp.where(new, a, b) for a, b in zip(fresh, moments, strict=True))
 
         changing = (state, *(getattr(self, name) for name in self.memory))
-        state, *memory = on_runs(bear, newborn, changing, self.slot, due)
-        return self._remembering(*memory), state
+        state, *memory = compact_and_apply_runs(bear, newborn, changing, self.slot, due_generation)
+        return self._with_memory(*memory), state
 
     # what is seen
 
     def alive(self, t: ArrayLike) -> Bool[Array, "*frames pool"]:
         """Who is alive at the time t [s] of the scene, or at the times of a film's frames."""
-        t = _per_frame(t, self.dies)
+        t = _align_with_frames(t, self.dies)
         return (self.born <= t) & (t < self.dies)
 
     def age(self, t: ArrayLike) -> Float[Array, "*frames pool"]:
         """Time since birth [s]; of the dead their whole life, of the unborn zero."""
-        seen = jnp.clip(_per_frame(t, self.dies), self.born, jnp.maximum(self.dies, self.born))
+        seen = jnp.clip(_align_with_frames(t, self.dies), self.born, jnp.maximum(self.dies, self.born))
         return jnp.where(self.generation < 0, 0.0, seen - self.born)
 
     def appearance(self, t: ArrayLike) -> Appearance:
         """Who is seen, how large [m], in which colour and how opaque, at the time t [s] or at a film's frames."""
         flat = self.generation.ravel()
         slot = jnp.broadcast_to(self.slot, self.generation.shape).ravel()
-        size = _spread(self.size, self.size_spread, self._drawn(slot, flat)[:, 7]).reshape(self.generation.shape)
+        size = _apply_spread(self.size, self.size_spread, self._draw(slot, flat)[:, 7]).reshape(self.generation.shape)
         life = jnp.where(self.generation < 0, 1.0, self.dies - self.born)
-        return self.look.seen(self.alive(t), size, self.age(t) / life)
+        return self.look.appearance_of(self.alive(t), size, self.age(t) / life)
 
-    def _remembering(self, *memory: Array) -> "Emitter":
+    def _with_memory(self, *memory: Array) -> "Emitter":
         where = lambda emitter: [getattr(emitter, name) for name in emitter.memory]  # noqa: E731
         return eqx.tree_at(where, self, list(memory), is_leaf=lambda leaf: leaf is None)
 
@@ -334,22 +354,22 @@ class Emitter(eqx.Module):
         return jax.tree.map(lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, self)
 
 
-def _spread(mean: Array, spread: Array, u: Array) -> Array:
+def _apply_spread(mean: Array, spread: Array, u: Array) -> Array:
     """Even within mean·(1 ± spread)."""
-    return rounded(mean * (1.0 + rounded(spread * (2.0 * u - 1.0))))
+    return force_rounding(mean * (1.0 + force_rounding(spread * (2.0 * u - 1.0))))
 
 
-def _chosen(flag: Array, a: Array, b: Array) -> Array:
+def _choose_vectors(flag: Array, a: Array, b: Array) -> Array:
     """Vectors a where flagged, else b; by components, since a choice between whole vectors costs several times that."""
-    return stacked([jnp.where(flag, p, q) for p, q in zip(components(a), components(b), strict=True)])
+    return stack_components([jnp.where(flag, p, q) for p, q in zip(components(a), components(b), strict=True)])
 
 
-def _per_frame(t: ArrayLike, like: Array) -> Array:
+def _align_with_frames(t: ArrayLike, like: Array) -> Array:
     t = jnp.asarray(t, like.dtype)
     return t.reshape(t.shape + (1,) * (like.ndim - t.ndim)) if t.ndim else t
 
 
-def _key_data(key: Any) -> Array:
+def _read_key(key: Any) -> Array:
     """The words of a key of JAX's default generator, or of a seed."""
     if isinstance(key, int | np.integer):
         key = jax.random.key(key)

@@ -3,7 +3,7 @@
 A source is called with uniform numbers `(*lanes, 3)` and returns the place [m] and the direction out of the shape there,
 both `(*lanes, dim)`. Its numbers can be swept and differentiated; where a particle is born moves with them.
 
-Births have the same bits in every program: products are `rounded` before they are added, which compilers would
+Births have the same bits in every program: products are `force_rounding` before they are added, which compilers would
 otherwise do or leave as it suits the rest of the program.
 """
 
@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from physjax.checks import concrete, demand, demand_direction, quantity
-from physjax.loops import rounded
-from physjax.vectors import components, over, scale, stacked, turn_left
+from physjax.checks import concrete_or_none, demand_all, demand_direction, quantity
+from physjax.loops import force_rounding
+from physjax.vectors import broadcast_vector, components, scale, stack_components, turn_left
 
 
 class Source(eqx.Module):
@@ -56,8 +56,8 @@ class Point(Source):
 
     def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
         """The point itself, and an isotropic direction."""
-        outward = isotropic(u, self.dim)
-        return over(self.at, outward), outward
+        outward = isotropic_direction(u, self.dim)
+        return broadcast_vector(self.at, outward), outward
 
 
 class Disc(Source):
@@ -84,12 +84,12 @@ class Disc(Source):
 
     def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
         """r = R √u₀ at the angle 2πu₁, and the normal."""
-        normal = over(direction_of(self.normal), u[..., : self.dim])
+        normal = broadcast_vector(unit_direction(self.normal), u[..., : self.dim])
         if self.dim == 2:
             across = scale(2.0 * u[..., 0] - 1.0, turn_left(normal))
         else:
-            across = scale(jnp.sqrt(u[..., 0]), around(normal, 2 * math.pi * u[..., 1]))
-        return over(self.center, normal) + rounded(self.radius * rounded(across)), normal
+            across = scale(jnp.sqrt(u[..., 0]), unit_vector_around(normal, 2 * math.pi * u[..., 1]))
+        return broadcast_vector(self.center, normal) + force_rounding(self.radius * force_rounding(across)), normal
 
 
 class Box(Source):
@@ -105,9 +105,9 @@ class Box(Source):
     upper: Float[Array, "dim"] = quantity("upper corner", "m", kind="place", per=None)
 
     def __check_init__(self):
-        lower, upper = concrete(self.lower), concrete(self.upper)
+        lower, upper = concrete_or_none(self.lower), concrete_or_none(self.upper)
         if lower is not None and upper is not None:
-            demand("upper corner [m]", self.upper, upper >= lower, f"at least the lower corner {lower}")
+            demand_all("upper corner [m]", self.upper, upper >= lower, f"at least the lower corner {lower}")
 
     @property
     def dim(self) -> int:
@@ -119,9 +119,9 @@ class Box(Source):
         share = u[..., : self.dim]
         # the place has taken the numbers; what is left after a stretch is as even, and independent of where that was
         again = jnp.mod(4096.0 * u, 1.0)
-        return over(self.lower, share) + rounded(over(self.upper - self.lower, share) * share), isotropic(
-            again, self.dim
-        )
+        return broadcast_vector(self.lower, share) + force_rounding(
+            broadcast_vector(self.upper - self.lower, share) * share
+        ), isotropic_direction(again, self.dim)
 
 
 class Sphere(Source):
@@ -144,9 +144,11 @@ class Sphere(Source):
 
     def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
         """R ∛u₂ (in the plane R √u₂) along an isotropic direction, which is also the outward one."""
-        outward = isotropic(u, self.dim)
+        outward = isotropic_direction(u, self.dim)
         share = jnp.ones_like(u[..., 2]) if self.shell else u[..., 2] ** (1 / self.dim)
-        return over(self.center, outward) + rounded(self.radius * rounded(scale(share, outward))), outward
+        return broadcast_vector(self.center, outward) + force_rounding(
+            self.radius * force_rounding(scale(share, outward))
+        ), outward
 
 
 class Mesh(Source):
@@ -189,22 +191,22 @@ class Mesh(Source):
         upto = jnp.cumsum(_length(normal))
         face = jnp.searchsorted(upto, u[..., 0] * upto[-1], side="right")
         face = jnp.minimum(face, self.faces.shape[1] - 1).astype(jnp.int32)
-        a, b, c, outward = (jnp.take(each, face, axis=0) for each in (*corner, direction_of(normal)))
+        a, b, c, outward = (jnp.take(each, face, axis=0) for each in (*corner, unit_direction(normal)))
         root = jnp.sqrt(u[..., 1])
-        return a + rounded(scale(1 - root, b - a)) + rounded(scale(root * u[..., 2], c - a)), outward
+        return a + force_rounding(scale(1 - root, b - a)) + force_rounding(scale(root * u[..., 2], c - a)), outward
 
 
-def isotropic(u: Float[Array, "*lanes 3"], dim: int) -> Float[Array, "*lanes dim"]:
+def isotropic_direction(u: Float[Array, "*lanes 3"], dim: int) -> Float[Array, "*lanes dim"]:
     """A direction, all equally likely: by Archimedes cos θ = 1 - 2u₁ is even on the sphere."""
     angle = 2 * math.pi * u[..., 0]
     if dim == 2:
-        return stacked([jnp.cos(angle), jnp.sin(angle)])
+        return stack_components([jnp.cos(angle), jnp.sin(angle)])
     height = 2.0 * u[..., 1]
     across = jnp.sqrt(height * (2.0 - height))
-    return stacked([across * jnp.cos(angle), across * jnp.sin(angle), 1.0 - height])
+    return stack_components([across * jnp.cos(angle), across * jnp.sin(angle), 1.0 - height])
 
 
-def in_cone(
+def direction_in_cone(
     axis: Float[Array, "*lanes dim"], cone: Float[Array, ""], u: Float[Array, "*lanes 2"]
 ) -> Float[Array, "*lanes dim"]:
     """A direction within the half-angle `cone` [rad] about a unit axis, all equally likely; smooth in the angle, at 0 too.
@@ -213,16 +215,16 @@ def in_cone(
     """
     if axis.shape[-1] == 2:
         angle = cone * (2.0 * u[..., 0] - 1.0)
-        return rounded(scale(jnp.cos(angle), axis)) + rounded(scale(jnp.sin(angle), turn_left(axis)))
+        return force_rounding(scale(jnp.cos(angle), axis)) + force_rounding(scale(jnp.sin(angle), turn_left(axis)))
     # a bound beyond π, so that the sine is computed with the births: compilers have another for constants
     edge = jnp.sin(jnp.minimum(cone / 2, 2.0 + u[..., 0]))
-    half = rounded(u[..., 0] * rounded(edge * edge))
+    half = force_rounding(u[..., 0] * force_rounding(edge * edge))
     sine = 2.0 * edge * jnp.sqrt(u[..., 0] * (1.0 - half))
-    sideways = around(axis, 2 * math.pi * u[..., 1])
-    return rounded(scale(1.0 - 2.0 * half, axis)) + rounded(scale(sine, sideways))
+    sideways = unit_vector_around(axis, 2 * math.pi * u[..., 1])
+    return force_rounding(scale(1.0 - 2.0 * half, axis)) + force_rounding(scale(sine, sideways))
 
 
-def around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Float[Array, "*lanes 3"]:
+def unit_vector_around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Float[Array, "*lanes 3"]:
     """The unit vector at an angle [rad] around a unit axis.
 
     The frame is the one without a branch of T. Duff et al., "Building an orthonormal basis, revisited", J. Comput.
@@ -232,21 +234,21 @@ def around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Flo
     sign = jnp.where(z < 0, -1.0, 1.0).astype(z.dtype)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = stacked([1.0 + rounded(sign * x * x * a), sign * b, -sign * x])
-    second = stacked([b, sign + rounded(y * y * a), -y])
-    return rounded(scale(jnp.cos(angle), first)) + rounded(scale(jnp.sin(angle), second))
+    first = stack_components([1.0 + force_rounding(sign * x * x * a), sign * b, -sign * x])
+    second = stack_components([b, sign + force_rounding(y * y * a), -y])
+    return force_rounding(scale(jnp.cos(angle), first)) + force_rounding(scale(jnp.sin(angle), second))
 
 
-def direction_of(vector: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+def unit_direction(vector: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """v/|v|, NaN of the zero vector, with the same bits in every program."""
     return vector / _length(vector)[..., None]
 
 
 def _length(vector: Array) -> Array:
-    return jnp.sqrt(sum(rounded(each * each) for each in components(vector)))
+    return jnp.sqrt(sum(force_rounding(each * each) for each in components(vector)))
 
 
 def _cross(a: Array, b: Array) -> Array:
     (x, y, z), (p, q, r) = components(a), components(b)
     parts = ((y * r, z * q), (z * p, x * r), (x * q, y * p))
-    return stacked([rounded(one) - rounded(other) for one, other in parts])
+    return stack_components([force_rounding(one) - force_rounding(other) for one, other in parts])

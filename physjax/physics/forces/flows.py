@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import declared, positive_integer, quantity
+from physjax.checks import as_positive_integer, quantity, unchecked_quantity
 from physjax.particles import Particles
 from physjax.parts import Field, Force
-from physjax.vectors import components, cross, dot, norm, over, scale, stacked, turn_left, unit
+from physjax.vectors import broadcast_vector, components, cross, dot, norm, scale, stack_components, turn_left, unit
 
 
 class Flow(Force):
@@ -58,9 +58,9 @@ class Turbulence(Flow):
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
     speed: Float[Array, ""] = quantity("speed of the eddies", "m/s", per=None, at_least=0)
     size: Float[Array, ""] = quantity("size of the eddies", "m", per=None, above=0)
-    waves: Float[Array, "modes dim"] = declared("wave vectors", "1/m", per=None)
-    swings: Float[Array, "modes dim"] = declared("amplitudes", per=None)
-    phases: Float[Array, "modes"] = declared("phases", "rad", per=None)
+    waves: Float[Array, "modes dim"] = unchecked_quantity("wave vectors", "1/m", per=None)
+    amplitudes: Float[Array, "modes dim"] = unchecked_quantity("amplitudes", per=None)
+    phases: Float[Array, "modes"] = unchecked_quantity("phases", "rad", per=None)
 
     def __init__(
         self, coefficient: ArrayLike, speed: ArrayLike, size: ArrayLike, *, key: Any, dim: int = 3, modes: int = 8
@@ -68,12 +68,12 @@ class Turbulence(Flow):
         if dim not in (2, 3):
             raise ValueError(f"Turbulence: got dim {dim}, expected 2 or 3.")
         self.coefficient, self.speed, self.size = coefficient, speed, size
-        modes = positive_integer("modes", modes)
+        modes = as_positive_integer("modes", modes)
         key = jax.random.key(key) if isinstance(key, int) else key
         along, across, long, late = jax.random.split(key, 4)
         waves = unit(jax.random.normal(along, (modes, dim)))
         other = turn_left(waves) if dim == 2 else unit(cross(waves, jax.random.normal(across, (modes, dim))))
-        self.swings = math.sqrt(2 / modes) * other
+        self.amplitudes = math.sqrt(2 / modes) * other
         self.waves = scale(2 * math.pi * jax.random.uniform(long, (modes,), minval=0.5, maxval=1.5), waves)
         self.phases = 2 * math.pi * jax.random.uniform(late, (modes,))
 
@@ -85,8 +85,8 @@ class Turbulence(Flow):
         for i in range(self.phases.shape[0]):
             wave, pace = components(self.waves[i]), norm(self.waves[i])
             swing = jnp.cos(sum(k * a for k, a in zip(wave, x, strict=True)) + (pace * turned + self.phases[i]))
-            total = [u + a * swing for u, a in zip(total, components(self.swings[i]), strict=True)]
-        return self.speed * stacked(total)
+            total = [u + a * swing for u, a in zip(total, components(self.amplitudes[i]), strict=True)]
+        return self.speed * stack_components(total)
 
 
 class Vortex(Flow):
@@ -115,8 +115,8 @@ class Vortex(Flow):
 
     def flow(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """Γ/(2πr²)·(1 - exp(-r²/c²)) n × r [m/s]."""
-        away = position - over(self.center, position)
-        around = turn_left(away) if self.axis is None else cross(over(unit(self.axis), position), away)
+        away = position - broadcast_vector(self.center, position)
+        around = turn_left(away) if self.axis is None else cross(broadcast_vector(unit(self.axis), position), away)
         turns = dot(around, around) / self.core**2
         # (1 - e^-s)/s, which is 1 where s is 0
         small = turns < 1e-12
@@ -141,13 +141,13 @@ class Attractor(Field):
 
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-μ d/(d² + ε²)^(3/2) [m/s²]."""
-        d = state.position - over(self.center, state.position)
+        d = state.position - broadcast_vector(self.center, state.position)
         near = 1 / jnp.sqrt(dot(d, d) + self.softening**2)
         return scale(-self.strength * near**3, d)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
         """-mμ/√(d² + ε²) [J]."""
-        d = state.position - over(self.center, state.position)
+        d = state.position - broadcast_vector(self.center, state.position)
         return -mass * self.strength / jnp.sqrt(dot(d, d) + self.softening**2)
 
 

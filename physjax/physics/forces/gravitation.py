@@ -12,7 +12,7 @@ from physjax.checks import quantity
 from physjax.particles import Particles
 from physjax.parts import Field
 
-TILE = 64
+SOURCES_PER_TILE = 64
 """Sources that act at once on all bodies: small enough for the vector registers and caches, large enough to hide the loop."""
 
 
@@ -40,26 +40,26 @@ class Gravitation(Field):
     ) -> Float[Array, "*scenes nodes dim"]:
         """Σ_j G m_j (x_j - x_i)/d³ [m/s²]."""
         x, gm = state.position, self._gm(state, mass)
-        targets = _components(x)
+        targets = _split_components(x)
 
         def pull(total, sources, strength):
             offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
-            near = self._near(offsets)
+            near = self._inverse_distance(offsets)
             weight = strength[..., None, :] * near * near * near  # in this order float32 reaches Pluto in SI units
             return [a + jnp.sum(weight * d, axis=-1) for a, d in zip(total, offsets, strict=True)]
 
-        return jnp.stack(_over_tiles(pull, [jnp.zeros_like(c) for c in targets], targets, gm), axis=-1)
+        return jnp.stack(_fold_tiles(pull, [jnp.zeros_like(c) for c in targets], targets, gm), axis=-1)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
         """-½ Σ_j m_i G m_j/d [J]: each pair's energy is halved between its two bodies."""
         x, gm = state.position, self._gm(state, mass)
-        targets = _components(x)
+        targets = _split_components(x)
 
         def add(total, sources, strength):
             offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
-            return total + jnp.sum(strength[..., None, :] * self._near(offsets), axis=-1)
+            return total + jnp.sum(strength[..., None, :] * self._inverse_distance(offsets), axis=-1)
 
-        return -0.5 * mass * _over_tiles(add, jnp.zeros_like(gm), targets, gm)
+        return -0.5 * mass * _fold_tiles(add, jnp.zeros_like(gm), targets, gm)
 
     def _gm(self, state: Particles, mass: Array) -> Array:
         """Strength of every body as a source [m³/s²]."""
@@ -69,7 +69,7 @@ class Gravitation(Field):
             )
         return jnp.broadcast_to(self.G * mass if self.gm is None else self.gm, state.lanes)
 
-    def _near(self, offsets: list[Array]) -> Array:
+    def _inverse_distance(self, offsets: list[Array]) -> Array:
         """1/d, and zero for a body and itself (or another at the same point)."""
         square = sum(d * d for d in offsets[1:]) + offsets[0] * offsets[0]
         apart = square > 0
@@ -79,20 +79,20 @@ class Gravitation(Field):
         return jnp.where(apart, 1.0 / jnp.sqrt(square), 0.0)  # rsqrt's derivative passes 1/d³, which underflows
 
 
-def _components(x: Array) -> list[Array]:
+def _split_components(x: Array) -> list[Array]:
     return [x[..., i] for i in range(x.shape[-1])]
 
 
-def _over_tiles(add, total, sources: list[Array], strength: Array):
+def _fold_tiles(add, total, sources: list[Array], strength: Array):
     """Fold `add(total, sources, strength)` over tiles of the last axis; the last is filled up with sources of no strength."""
     count = strength.shape[-1]
-    if count <= TILE:
+    if count <= SOURCES_PER_TILE:
         return add(total, sources, strength)
-    missing = -count % TILE
+    missing = -count % SOURCES_PER_TILE
 
     def tiles(a):
         filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)])
-        return jnp.moveaxis(filled.reshape((*a.shape[:-1], -1, TILE)), -2, 0)
+        return jnp.moveaxis(filled.reshape((*a.shape[:-1], -1, SOURCES_PER_TILE)), -2, 0)
 
     # recomputing a tile in reverse mode keeps its memory linear too
     body = jax.checkpoint(lambda total, tile: (add(total, *tile), None), prevent_cse=False)

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import declared, quantity
-from physjax.loops import Time, rest_of
+from physjax.checks import quantity, unchecked_quantity
+from physjax.loops import Time, float32_remainder
 from physjax.particles import Particles
 from physjax.parts import Field, Force, Function
-from physjax.physics.forces.time_dependent import lasts_at, share_within
-from physjax.vectors import dot, norm, over, scale, spin, unit
+from physjax.physics.forces.time_dependent import acting_share, is_acting
+from physjax.vectors import broadcast_vector, dot, norm, scale, spin, unit
 
 
 class Blast(Force):
@@ -39,39 +39,39 @@ class Blast(Force):
     reach: Float[Array, "..."] = quantity("reach of the blast", "m", above=0)
     at: Float[Array, "..."] = quantity("start of the blast", "s")
     duration: Float[Array, "..."] = quantity("duration of the blast", "s", above=0)
-    at_rest: Float[Array, "..."] | None = declared(
+    at_rest: Float[Array, "..."] | None = unchecked_quantity(
         "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
     )
 
     def __post_init__(self):
-        self.at_rest = rest_of(self.at, self.at_rest)
+        self.at_rest = float32_remainder(self.at, self.at_rest)
 
     def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """J/(1 + (d/r)²)/duration away from the center while the blast lasts [N]."""
-        return scale(jnp.where(lasts_at(self, t, state), 1 / self.duration, 0.0), self.received(state))
+        return scale(jnp.where(is_acting(self, t, state), 1 / self.duration, 0.0), self.lane_impulse(state))
 
-    def received(self, state: Particles) -> Float[Array, "*lanes dim"]:
+    def lane_impulse(self, state: Particles) -> Float[Array, "*lanes dim"]:
         """The impulse that each lane gets if it stays where it is [N s]."""
-        d = state.position - over(self.center, state.position)
+        d = state.position - broadcast_vector(self.center, state.position)
         return scale(self.impulse / (1 + dot(d, d) / self.reach**2), unit(d))
 
-    def during(self, t: Time, dt: Time, state: Particles) -> "_SteadyBlast":
+    def averaged_over_step(self, t: Time, dt: Time, state: Particles) -> "_AveragedBlast":
         """The mean in time of the force over the step from t to t + dt."""
-        return _SteadyBlast(self, share_within(self, t, dt, state) / self.duration)
+        return _AveragedBlast(self, acting_share(self, t, dt, state) / self.duration)
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
         """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole blast."""
         return self.at, self.at + self.duration
 
 
-class _SteadyBlast(Force):
+class _AveragedBlast(Force):
     """A blast that lasts: so many of its impulses a second."""
 
     blast: Blast
-    rate: Float[Array, "..."] = declared("blasts a second", "1/s", per="memory")
+    rate: Float[Array, "..."] = unchecked_quantity("blasts a second", "1/s", per="memory")
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        return scale(self.rate, self.blast.received(state))
+        return scale(self.rate, self.blast.lane_impulse(state))
 
 
 class StokesDrag(Force):
@@ -84,7 +84,7 @@ class StokesDrag(Force):
         [-1. -2.]
     """
 
-    definite: ClassVar[bool] = True
+    dissipative_symmetric: ClassVar[bool] = True
     coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
     wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
 
@@ -97,7 +97,7 @@ class StokesDrag(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-b (v - wind) [N]."""
-        return scale(-self.coefficient, _airspeed(state, self.wind))
+        return scale(-self.coefficient, _air_velocity(state, self.wind))
 
 
 class QuadraticDrag(Force):
@@ -108,7 +108,7 @@ class QuadraticDrag(Force):
         [-3. -4.]
     """
 
-    definite: ClassVar[bool] = True
+    dissipative_symmetric: ClassVar[bool] = True
     area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
     coefficient: Float[Array, "..."] = quantity("drag coefficient C_d", "1", at_least=0)
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
@@ -116,7 +116,7 @@ class QuadraticDrag(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-½ρC_dA |v - wind| (v - wind) [N]."""
-        v = _airspeed(state, self.wind)
+        v = _air_velocity(state, self.wind)
         return scale(-0.5 * self.density * self.coefficient * self.area * norm(v), v)
 
 
@@ -134,7 +134,7 @@ class SphereDrag(Force):
         1.0
     """
 
-    definite: ClassVar[bool] = True
+    dissipative_symmetric: ClassVar[bool] = True
     radius: Float[Array, "..."] = quantity("radius", "m", above=0)
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", above=0, default=1.204)
     viscosity: Float[Array, "..."] = quantity("viscosity", "Pa s", above=0, default=1.81e-5)
@@ -142,7 +142,7 @@ class SphereDrag(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The corrected Stokes force [N]."""
-        v = _airspeed(state, self.wind)
+        v = _air_velocity(state, self.wind)
         reynolds = 2 * self.density * self.radius / self.viscosity * norm(v)
         reynolds = jnp.maximum(reynolds, 1e-24)  # its power has no slope at 0; two derivatives still fit in float32
         correction = 1 + 0.15 * reynolds**0.681 + (0.407 / 24) * reynolds**2 / (reynolds + 8710)
@@ -168,8 +168,8 @@ class Magnus(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """½ρAC_L |v| ω̂×v [N], v relative to the wind."""
-        v = _airspeed(state, self.wind)
-        axis = jnp.sign(self.axis) if v.shape[-1] == 2 else unit(over(self.axis, v))
+        v = _air_velocity(state, self.wind)
+        axis = jnp.sign(self.axis) if v.shape[-1] == 2 else unit(broadcast_vector(self.axis, v))
         return scale(0.5 * self.density * self.coefficient * self.area * norm(v), spin(axis, v))
 
 
@@ -192,8 +192,8 @@ class RotatingFrame(Field):
         r, v = state.position, state.velocity
         if self.omega_rate is None:
             return -spin(self.omega, spin(self.omega, r) + 2 * v)
-        rate = _turning(self.omega_rate, r)
-        omega = _turning(self.omega, r) + scale(t, rate)
+        rate = _broadcast_omega(self.omega_rate, r)
+        omega = _broadcast_omega(self.omega, r) + scale(t, rate)
         return -spin(omega, spin(omega, r) + 2 * v) - spin(rate, r)
 
 
@@ -215,7 +215,7 @@ class Anchor(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The pull of the spring [N]."""
-        d = state.position - over(self.point, state.position)
+        d = state.position - broadcast_vector(self.point, state.position)
         if self.rest_length is None:
             pull = scale(-self.stiffness, d)
             return pull if self.damping is None else pull - scale(self.damping, state.velocity)
@@ -227,7 +227,7 @@ class Anchor(Force):
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
         """½k(|d| - L)² [J]."""
-        d = state.position - over(self.point, state.position)
+        d = state.position - broadcast_vector(self.point, state.position)
         return 0.5 * self.stiffness * (dot(d, d) if self.rest_length is None else (norm(d) - self.rest_length) ** 2)
 
 
@@ -244,11 +244,11 @@ def independent(force: Callable) -> Function:
     return Function(force, couples=False)
 
 
-def _airspeed(state: Particles, wind: Array | None) -> Array:
+def _air_velocity(state: Particles, wind: Array | None) -> Array:
     """Velocity relative to the air."""
-    return state.velocity if wind is None else state.velocity - over(wind, state.velocity)
+    return state.velocity if wind is None else state.velocity - broadcast_vector(wind, state.velocity)
 
 
-def _turning(omega: Array, r: Array) -> Array:
+def _broadcast_omega(omega: Array, r: Array) -> Array:
     """An angular velocity for every lane: a number in the plane, a vector in space."""
-    return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else over(omega, r)
+    return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else broadcast_vector(omega, r)

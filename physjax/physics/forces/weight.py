@@ -10,12 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import concrete, positive_integer, quantity, real_array, real_quantity
+from physjax.checks import as_positive_integer, as_real_array, as_real_quantity, concrete_or_none, quantity
 from physjax.particles import Particles
 from physjax.parts import Field, Force
-from physjax.vectors import dot, over, upward
+from physjax.vectors import axis_vector, broadcast_vector, dot
 
-G = 9.8
+EARTH_GRAVITY = 9.8
 """Standard gravity as the lecture has it [m/s²]."""
 
 
@@ -32,24 +32,24 @@ class Gravity(Field):
         [ -0.  -19.6]
     """
 
-    definite: ClassVar[bool] = True
+    dissipative_symmetric: ClassVar[bool] = True
     g: Float[Array, "..."] | None = quantity("g", "m/s²", at_least=0, default=None)
     up: int = eqx.field(static=True, default=1)
     vector: Float[Array, "..."] | None = quantity("gravity", "m/s²", kind="vector", default=None)
 
     def __init__(self, g: Any = 9.8, up: int | None = None, *, vector: Any = None):
-        up = None if up is None else axis_number(up)
+        up = None if up is None else check_axis(up)
         if vector is None:
-            self.g, self.up, self.vector = _downward(g), 1 if up is None else up, None
+            self.g, self.up, self.vector = _check_g(g), 1 if up is None else up, None
             return
-        if g is not None and not (isinstance(g, float) and g == G):
+        if g is not None and not (isinstance(g, float) and g == EARTH_GRAVITY):
             raise ValueError(
                 f"Gravity: got both g = {g} and a vector, expected one of them: Gravity(vector=...) has its g."
             )
-        self.vector = real_quantity("gravity [m/s²]", vector)
-        straight = _along_an_axis(self.vector)
+        self.vector = as_real_quantity("gravity [m/s²]", vector)
+        straight = _find_straight_axis(self.vector)
         if straight is None:
-            self.g, self.up = None, _steepest_axis(self.vector) if up is None else up
+            self.g, self.up = None, _find_steepest_axis(self.vector) if up is None else up
             return
         self.g, self.up, self.vector = *straight, None
         if up not in (None, self.up):
@@ -60,13 +60,13 @@ class Gravity(Field):
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-g along the upward axis [m/s²]."""
         if self.vector is not None:
-            return over(self.vector, state.velocity)
-        return upward(-self.g, self.up, state.velocity)
+            return broadcast_vector(self.vector, state.velocity)
+        return axis_vector(-self.g, self.up, state.velocity)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
         """m g y [J]."""
         if self.vector is not None:
-            return -mass * dot(over(self.vector, state.position), state.position)
+            return -mass * dot(broadcast_vector(self.vector, state.position), state.position)
         return mass * self.g * state.position[..., self.up]
 
     @property
@@ -92,7 +92,7 @@ class Buoyancy(Force):
         [ 0.  19.6]
     """
 
-    definite: ClassVar[bool] = True
+    dissipative_symmetric: ClassVar[bool] = True
     density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0)
     volume: Float[Array, "..."] | None = quantity("volume", "m³", at_least=0, default=None)
     radius: Float[Array, "..."] | None = quantity("radius", "m", above=0, default=None)
@@ -102,7 +102,7 @@ class Buoyancy(Force):
 
     def __check_init__(self):
         if self.up is not None:
-            axis_number(self.up)
+            check_axis(self.up)
         given = (self.volume is not None, self.radius is not None, self.surface is not None)
         if given not in ((True, False, False), (False, True, True)):
             raise ValueError(
@@ -112,23 +112,21 @@ class Buoyancy(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """ρ_f V g along the upward axis [N]."""
-        return upward(self.density * self._g * self.displaced(state), self._up, state.velocity)
+        return axis_vector(self.density * self._g * self.displaced_volume(state), self._up, state.velocity)
 
     def under(self, weight: tuple[Any, int]) -> "Buoyancy":
         """The buoyancy under the scene's weight, whose g and axis it takes over; ValueError where it was told others."""
         g, up = weight
-        given, scene = (None if a is None else concrete(a) for a in (self.g, g))
+        given, scene = (None if a is None else concrete_or_none(a) for a in (self.g, g))
         if (
             g is None
             or self.up not in (None, up)
             or (given is not None and scene is not None and np.any(given != scene))
         ):
-            told = (
-                f"g = {'the same' if self.g is None else given} and up = {'the same' if self.up is None else self.up}"
-            )
+            got = f"g = {'the same' if self.g is None else given} and up = {'the same' if self.up is None else self.up}"
             weighs = "a slanting vector" if g is None else f"g = {scene} and up = {up}"
             raise ValueError(
-                f"Buoyancy: got {told}, but the scene's Gravity has {weighs}; expected one g and one axis for both. Leave "
+                f"Buoyancy: got {got}, but the scene's Gravity has {weighs}; expected one g and one axis for both. Leave "
                 "them out of Buoyancy, which then takes those of the scene."
             )
         if self.g is not None and (given is None or scene is None):
@@ -136,7 +134,7 @@ class Buoyancy(Force):
             return replace(self, g=jnp.where(self.g == g, self.g, jnp.nan), up=up)
         return replace(self, g=g if self.g is None else self.g, up=up)
 
-    def displaced(self, state: Particles) -> Float[Array, "..."]:
+    def displaced_volume(self, state: Particles) -> Float[Array, "..."]:
         """Volume below the surface [m³]."""
         if self.surface is None:
             return self.volume
@@ -157,43 +155,43 @@ class Buoyancy(Force):
 
     @property
     def _g(self) -> ArrayLike:
-        return G if self.g is None else self.g
+        return EARTH_GRAVITY if self.g is None else self.g
 
     @property
     def _up(self) -> int:
         return 1 if self.up is None else self.up
 
 
-def axis_number(up: Any) -> int:
+def check_axis(up: Any) -> int:
     """An axis as a Python int, 0 for x; TypeError or ValueError for what is none."""
-    return positive_integer("up (0: x, 1: y, 2: z)", up, at_least=0)
+    return as_positive_integer("up (0: x, 1: y, 2: z)", up, at_least=0)
 
 
-def _downward(g: Any) -> Array:
+def _check_g(g: Any) -> Array:
     """g as a number >= 0; what other engines are given, a vector or a negative number, gets an error with the right call."""
-    value = real_array("g [m/s²]", g)
-    number = concrete(value)
+    value = as_real_array("g [m/s²]", g)
+    number = concrete_or_none(value)
     if number is not None and np.any(number < 0):
         if number.ndim == 1 and number.shape[0] in (2, 3):
             call = f"For a vector write Gravity(vector={tuple(number.tolist())})"
         else:
             call = f"Write Gravity({abs(float(number.min())):g}), with up=2 where z is up"
         raise ValueError(f"g [m/s²]: got {number}, expected a number >= 0: gravity points down by itself. {call}.")
-    return real_quantity("g [m/s²]", value, at_least=0)
+    return as_real_quantity("g [m/s²]", value, at_least=0)
 
 
-def _along_an_axis(vector: Array) -> tuple[Array, int] | None:
+def _find_straight_axis(vector: Array) -> tuple[Array, int] | None:
     """g and the axis that is up of a gravity that points straight down one axis in all lanes; None of others, or a traced one."""
-    values = concrete(vector)
+    values = concrete_or_none(vector)
     if values is None or not values.ndim or np.any(values > 0):
         return None
     axes = np.flatnonzero(np.any(values.reshape(-1, values.shape[-1]) != 0, axis=0))
     return (-vector[..., axes[0]], int(axes[0])) if len(axes) == 1 else None
 
 
-def _steepest_axis(vector: Array) -> int:
+def _find_steepest_axis(vector: Array) -> int:
     """The axis against which a slanting gravity pulls most, over all lanes; y of one that is traced, or pulls along axes only."""
-    values = concrete(vector)
+    values = concrete_or_none(vector)
     if values is None or values.ndim == 0 or values.shape[-1] == 1:
         return 1
     pull = values.reshape(-1, values.shape[-1]).sum(axis=0)

@@ -7,10 +7,10 @@
 
 Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
 inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
-`Hull`; `contacts=(Touch(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
+`ContactPoints`; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
 """
 
-from physjax.physics.rigid.contact_points import Hull, Touch
+from physjax.physics.rigid.contact_points import ContactPoints, Hull, SurfaceContact, Touch
 from physjax.physics.rigid.joints import Joints, hinge
 from physjax.physics.rigid.loads import (
     AtPoint,
@@ -29,11 +29,13 @@ from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_acc
 __all__ = [
     "AtPoint",
     "Balls",
+    "ContactPoints",
     "Hull",
     "Joints",
     "Load",
     "RigidBodies",
     "RotationalDrag",
+    "SurfaceContact",
     "Thrust",
     "Torque",
     "Touch",

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import any_lane, loop
+from physjax.backend import any_lane, bounded_while_loop
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import RigidBodies, answer
+from physjax.physics.rigid.spatial import RigidBodies, apply_inverse_inertia
 from physjax.vectors import cross, dot, norm
 
-SWEEPS = 256
+MAX_SWEEPS = 256
 """The most passes over all points. A point alone needs two, a box on its face about twenty, at the
 edge of what friction can hold a hundred."""
 
@@ -34,10 +34,10 @@ class Points(NamedTuple):
     friction: tuple[Float[Array, "points *lanes"], Float[Array, "points *lanes"]] | None
 
 
-class _Rows(NamedTuple):
+class _PointRows(NamedTuple):
     """Each point's own answer K = W_kk: what the sweeps need of it. Vectors are `(points, 3, *lanes)`, without friction None.
 
-    `share` is 1/(n·Kn) of points that take part, else 0; `back` K⁻¹, `aside` Kn, `lean` K⁻¹n/(n·K⁻¹n), `brake` one over
+    `share` is 1/(n·Kn) of points that take part, else 0; `back` K⁻¹, `normal_response` Kn, `push_direction` K⁻¹n/(n·K⁻¹n), `slip_mobility` one over
     the stiffest way across the normal. With `push` the normal impulses are given, and only friction is looked for.
     """
 
@@ -45,15 +45,15 @@ class _Rows(NamedTuple):
     normal: Array
     before: Array
     share: Array
-    back: Array | None = None
-    aside: Array | None = None
-    lean: Array | None = None
-    brake: Array | None = None
+    inverse: Array | None = None
+    normal_response: Array | None = None
+    push_direction: Array | None = None
+    slip_mobility: Array | None = None
     friction: tuple[Array, Array] | None = None
     push: Array | None = None
 
 
-def impulses(
+def apply_contact_impulses(
     points: Points,
     active: Bool[Array, "points *lanes"],
     bodies: RigidBodies,
@@ -73,20 +73,20 @@ def impulses(
     if restitution is not None and points.friction is not None:
         # in an impact what sticks must do so by μ_k too: discs that shrink afterwards could give energy
         points = points._replace(friction=(points.friction[1],) * 2)
-    body = _body(bodies, inertia)
-    rows = _rows(points, active, body)
-    j = _settled(rows, body, jnp.zeros_like(rows.before))
-    felt = _speed(rows, _given(rows, body, j)[None])
-    work, square = (jnp.sum(part * j, axis=(0, 1)) for part in (rows.before, felt))
+    body = _build_body(bodies, inertia)
+    rows = _build_rows(points, active, body)
+    j = _solve_fixed_point(rows, body, jnp.zeros_like(rows.before))
+    response = _point_velocity(rows, _sum_body_changes(rows, body, j)[None])
+    work, square = (jnp.sum(part * j, axis=(0, 1)) for part in (rows.before, response))
     wanted = jnp.ones_like(work)
     if restitution is not None:
-        push = _along(rows.normal, j)
+        push = _dot(rows.normal, j)
         total = jnp.sum(push, axis=0)
         wanted = 1 + jnp.sum(restitution * push, axis=0) / jnp.where(total > 0, total, 1.0)
     share = jnp.minimum(wanted, jnp.where(square > 0, -2.0 * work / jnp.where(square > 0, square, 1.0), 0.0))
     j = share[None, None] * j
     if restitution is not None and points.friction is not None:
-        j = _settled(rows._replace(push=_along(rows.normal, j)), body, j)
+        j = _solve_fixed_point(rows._replace(push=_dot(rows.normal, j)), body, j)
     push = jnp.moveaxis(j, 1, -1)
     given = jnp.sum(push, axis=0), jnp.sum(cross(points.arm, push), axis=0)
     momenta = bodies.momentum + given[0], bodies.angular_momentum + given[1]
@@ -96,138 +96,142 @@ def impulses(
 class _Body(NamedTuple):
     """1/m `(1, 1, *lanes)`, and R I⁻¹ Rᵀ `(1, 3, 3, *lanes)`."""
 
-    lightness: Array
-    turns: Array
+    inverse_mass: Array
+    inverse_inertia: Array
 
 
-def _body(bodies: RigidBodies, inertia: Inertia) -> _Body:
+def _build_body(bodies: RigidBodies, inertia: Inertia) -> _Body:
     axes = jnp.eye(3, dtype=bodies.dtype).reshape(3, *(1,) * len(bodies.lanes), 3)
     axes = jnp.broadcast_to(axes, (3, *bodies.position.shape))
-    turns = _spread(jax.vmap(lambda axis: answer(bodies, inertia, axis))(axes))
-    return _Body(jnp.broadcast_to(1 / inertia.mass, (1, 1, *bodies.lanes)), turns[None])
+    inverse_inertia = _move_component_second(jax.vmap(lambda axis: apply_inverse_inertia(bodies, inertia, axis))(axes))
+    return _Body(jnp.broadcast_to(1 / inertia.mass, (1, 1, *bodies.lanes)), inverse_inertia[None])
 
 
-def _spread(vectors: Array) -> Array:
+def _move_component_second(vectors: Array) -> Array:
     """Vectors with their component in the second axis instead of the last."""
     return jnp.moveaxis(vectors, -1, 1)
 
 
-def _rows(points: Points, active: Array, body: _Body) -> _Rows:
-    arm, normal, before = (_spread(vector) for vector in points[:3])
-    aside = _answered(body, arm, normal)
-    stiffness = _along(normal, aside)
-    rows = _Rows(arm, normal, before, jnp.where(active, 1 / stiffness, 0.0))
+def _build_rows(points: Points, active: Array, body: _Body) -> _PointRows:
+    arm, normal, before = (_move_component_second(vector) for vector in points[:3])
+    normal_response = _apply_point_mobility(body, arm, normal)
+    stiffness = _dot(normal, normal_response)
+    rows = _PointRows(arm, normal, before, jnp.where(active, 1 / stiffness, 0.0))
     if points.friction is None:
         return rows
     axes = jnp.eye(3, dtype=arm.dtype).reshape(3, 1, 3, *(1,) * (arm.ndim - 2))
-    columns = jnp.stack([_answered(body, arm, jnp.broadcast_to(axis, arm.shape)) for axis in axes], axis=1)
+    columns = jnp.stack([_apply_point_mobility(body, arm, jnp.broadcast_to(axis, arm.shape)) for axis in axes], axis=1)
     minors = jnp.stack([_cross(columns[:, i - 2], columns[:, i - 1]) for i in range(3)], axis=1)
-    volume = _along(columns[:, 0], minors[:, 0])
-    back = minors / volume[:, None, None]
-    leaning = _times(back, normal)
-    ease = _along(normal, leaning)
+    volume = _dot(columns[:, 0], minors[:, 0])
+    inverse = minors / volume[:, None, None]
+    leaning = _multiply(inverse, normal)
+    ease = _dot(normal, leaning)
     # of K across the normal: its trace, and its determinant, |K| n·K⁻¹n
     half = (columns[:, 0, 0] + columns[:, 1, 1] + columns[:, 2, 2] - stiffness) / 2
     stiffest = half + jnp.sqrt(jnp.maximum(half * half - volume * ease, 1e-30))
     return rows._replace(
-        back=back, aside=aside, lean=leaning / ease[:, None], brake=1 / stiffest, friction=points.friction
+        inverse=inverse,
+        normal_response=normal_response,
+        push_direction=leaning / ease[:, None],
+        slip_mobility=1 / stiffest,
+        friction=points.friction,
     )
 
 
-def _settled(rows: _Rows, body: _Body, start: Array) -> Array:
+def _solve_fixed_point(rows: _PointRows, body: _Body, start: Array) -> Array:
     """Impulses `(points, 3, *lanes)` that a sweep over the points leaves as they are.
 
     They move with the rows as a fixed point does: a linear problem, swept alike, so that no derivative follows the sweeps.
     """
 
     def left(j):
-        return _sweep(rows, body, j)[0] - j
+        return _sweep_points(rows, body, j)[0] - j
 
     def swept(_, j):
-        moved = _given(rows, body, j)
+        moved = _sum_body_changes(rows, body, j)
 
         def pass_(carry):
-            after, moved = _sweep(rows, body, carry[0], carry[1])
-            return after, moved, _changes(carry[0], after)
+            after, moved = _sweep_points(rows, body, carry[0], carry[1])
+            return after, moved, _find_changed_lanes(carry[0], after)
 
-        return _repeated(pass_, (j, moved, jnp.any(rows.share > 0, axis=0)))[0]
+        return _repeat_until_settled(pass_, (j, moved, jnp.any(rows.share > 0, axis=0)))[0]
 
-    def answered(change, right):
+    def solve_linear(change, right):
         def pass_(carry):
             after = carry[0] + change(carry[0]) - right
-            return after, _changes(carry[0], after)
+            return after, _find_changed_lanes(carry[0], after)
 
-        return _repeated(pass_, (jnp.zeros_like(right), jnp.any(right != 0, axis=(0, 1))))[0]
+        return _repeat_until_settled(pass_, (jnp.zeros_like(right), jnp.any(right != 0, axis=(0, 1))))[0]
 
-    solve = partial(lax.custom_linear_solve, solve=answered, transpose_solve=answered)
+    solve = partial(lax.custom_linear_solve, solve=solve_linear, transpose_solve=solve_linear)
     return lax.custom_root(left, start, swept, solve)
 
 
-def _sweep(rows: _Rows, body: _Body, j: Array, moved: Array | None = None) -> tuple[Array, Array]:
+def _sweep_points(rows: _PointRows, body: _Body, j: Array, moved: Array | None = None) -> tuple[Array, Array]:
     """The impulses after every point had its turn, and the velocity and ω `(6, *lanes)` that they give."""
-    moved = _given(rows, body, j) if moved is None else moved
-    moved, after = lax.scan(partial(_turn, body), moved, (rows, j))
+    moved = _sum_body_changes(rows, body, j) if moved is None else moved
+    moved, after = lax.scan(partial(_update_point, body), moved, (rows, j))
     return after, moved
 
 
-def _changes(before: Array, after: Array) -> Array:
+def _find_changed_lanes(before: Array, after: Array) -> Array:
     """Which lanes a pass changes by more than rounding."""
     change, size = (jnp.sum(jnp.abs(part), axis=(0, 1)) for part in (after - before, after))
     return change > 256 * float(jnp.finfo(after.dtype).eps) * size
 
 
-def _repeated(pass_: Callable, start: tuple) -> tuple:
+def _repeat_until_settled(pass_: Callable, start: tuple) -> tuple:
     """Passes until the last part of what they carry, the lanes that they change, is empty."""
-    return loop(lambda carry: any_lane(carry[-1]), pass_, start, most=SWEEPS)
+    return bounded_while_loop(lambda carry: any_lane(carry[-1]), pass_, start, most=MAX_SWEEPS)
 
 
-def _turn(body: _Body, moved: Array, point: tuple[_Rows, Array]) -> tuple[Array, Array]:
+def _update_point(body: _Body, moved: Array, point: tuple[_PointRows, Array]) -> tuple[Array, Array]:
     """One point's turn, given what the others do: it sticks if it can, else it is pushed and slips."""
     row, old = jax.tree.map(lambda part: part[None], point)
-    v, pushed = row.before + _speed(row, moved[None]), _along(row.normal, old)
-    push = jnp.maximum(pushed - _along(row.normal, v) * row.share, 0.0) if row.push is None else row.push
+    v, pushed = row.before + _point_velocity(row, moved[None]), _dot(row.normal, old)
+    push = jnp.maximum(pushed - _dot(row.normal, v) * row.share, 0.0) if row.push is None else row.push
     new = push[:, None] * row.normal
     if row.friction is not None:
         static, kinetic = row.friction
-        stick = old - _times(row.back, v)
+        stick = old - _multiply(row.inverse, v)
         if row.push is not None:
-            stick, static = stick + (push - _along(row.normal, stick))[:, None] * row.lean, kinetic
-        v = v + (push - pushed)[:, None] * row.aside
-        slip = _across(row.normal, old - row.brake[:, None] * v)
-        size, most = _size(slip), kinetic * push
+            stick, static = stick + (push - _dot(row.normal, stick))[:, None] * row.push_direction, kinetic
+        v = v + (push - pushed)[:, None] * row.normal_response
+        slip = _project_across(row.normal, old - row.slip_mobility[:, None] * v)
+        size, most = _norm(slip), kinetic * push
         slip = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0)[:, None] * slip
-        held = _along(row.normal, stick)
-        sticks = (held >= 0) & (_size(_across(row.normal, stick)) <= static * held)
+        held = _dot(row.normal, stick)
+        sticks = (held >= 0) & (_norm(_project_across(row.normal, stick)) <= static * held)
         new = jnp.where((row.share > 0)[:, None], jnp.where(sticks[:, None], stick, new + slip), 0.0)
-    return moved + _gives(row, body, new - old)[0], new[0]
+    return moved + _compute_body_changes(row, body, new - old)[0], new[0]
 
 
-def _given(rows: _Rows, body: _Body, j: Array) -> Array:
+def _sum_body_changes(rows: _PointRows, body: _Body, j: Array) -> Array:
     """The velocity and ω `(6, *lanes)` that all the impulses give to their body."""
-    return jnp.sum(_gives(rows, body, j), axis=0)
+    return jnp.sum(_compute_body_changes(rows, body, j), axis=0)
 
 
-def _gives(rows: _Rows, body: _Body, j: Array) -> Array:
+def _compute_body_changes(rows: _PointRows, body: _Body, j: Array) -> Array:
     """The velocity and ω `(points, 6, *lanes)` that each impulse gives."""
-    return jnp.concatenate([body.lightness * j, _times(body.turns, _cross(rows.arm, j))], axis=1)
+    return jnp.concatenate([body.inverse_mass * j, _multiply(body.inverse_inertia, _cross(rows.arm, j))], axis=1)
 
 
-def _speed(rows: _Rows, moved: Array) -> Array:
+def _point_velocity(rows: _PointRows, moved: Array) -> Array:
     """What velocity and ω `(1, 6, *lanes)` give to the points."""
     return moved[:, :3] + _cross(jnp.broadcast_to(moved[:, 3:], rows.arm.shape), rows.arm)
 
 
-def _answered(body: _Body, arm: Array, vector: Array) -> Array:
+def _apply_point_mobility(body: _Body, arm: Array, vector: Array) -> Array:
     """Kx: the velocity that an impulse x at a point gives to it."""
-    return body.lightness * vector + _cross(_times(body.turns, _cross(arm, vector)), arm)
+    return body.inverse_mass * vector + _cross(_multiply(body.inverse_inertia, _cross(arm, vector)), arm)
 
 
-def _times(columns: Array, vector: Array) -> Array:
+def _multiply(columns: Array, vector: Array) -> Array:
     """A symmetric matrix `(points, 3, 3, *lanes)` times vectors."""
     return sum(columns[:, i] * vector[:, i : i + 1] for i in range(3))
 
 
-def _along(a: Array, b: Array) -> Array:
+def _dot(a: Array, b: Array) -> Array:
     """Scalar products of vectors with the component second."""
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
@@ -236,9 +240,9 @@ def _cross(a: Array, b: Array) -> Array:
     return jnp.stack([a[:, i - 2] * b[:, i - 1] - a[:, i - 1] * b[:, i - 2] for i in range(3)], axis=1)
 
 
-def _across(normal: Array, vector: Array) -> Array:
-    return vector - _along(normal, vector)[:, None] * normal
+def _project_across(normal: Array, vector: Array) -> Array:
+    return vector - _dot(normal, vector)[:, None] * normal
 
 
-def _size(vector: Array) -> Array:
+def _norm(vector: Array) -> Array:
     return norm(jnp.moveaxis(vector, 1, -1))

@@ -13,8 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from numpy.linalg import eigh
 
-from physjax.checks import concrete, declared, demand, real_quantity
-from physjax.meshes import checked_mesh
+from physjax.checks import as_real_quantity, concrete_or_none, demand_all, unchecked_quantity
+from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia_tensors import (
     demand_closed,
     find_quaternion,
@@ -37,16 +37,16 @@ class Inertia(eqx.Module):
         [13.0, 10.0, 5.0]
     """
 
-    mass: Float[Array, "..."] = declared("mass", "kg", above=0)
-    principal: Float[Array, "*lanes 3"] = declared("principal moments", "kg m²", kind="vector", at_least=0)
-    axes: Float[Array, "*lanes 4"] | None = declared("axes", kind="rotation")
-    arm: Float[Array, "*lanes 3"] | None = declared("arm of the pivot", "m", kind="vector")
-    pivot: Float[Array, "*lanes 3"] | None = declared("pivot", "m", kind="place")
+    mass: Float[Array, "..."] = unchecked_quantity("mass", "kg", above=0)
+    principal: Float[Array, "*lanes 3"] = unchecked_quantity("principal moments", "kg m²", kind="vector", at_least=0)
+    axes: Float[Array, "*lanes 4"] | None = unchecked_quantity("axes", kind="rotation")
+    arm: Float[Array, "*lanes 3"] | None = unchecked_quantity("arm of the pivot", "m", kind="vector")
+    pivot: Float[Array, "*lanes 3"] | None = unchecked_quantity("pivot", "m", kind="place")
 
     def __init__(self, mass: Any, principal: Any, axes: Any = None):
-        self.mass = real_quantity("mass [kg]", mass, above=0.0)
-        self.principal = _real_moments(principal)
-        self.axes = None if axes is None else real_turn("axes", axes)
+        self.mass = as_real_quantity("mass [kg]", mass, above=0.0)
+        self.principal = _check_moments(principal)
+        self.axes = None if axes is None else check_quaternion("axes", axes)
         self.arm = self.pivot = None
 
     @property
@@ -71,8 +71,8 @@ class Inertia(eqx.Module):
         """
         if self.arm is not None:
             raise ValueError("about: got an inertia with a pivot, expected one about the centre of mass.")
-        parts = _components("pivot [m]", point)
-        away = [i for i, part in enumerate(parts) if concrete(part) is None or np.any(concrete(part))]
+        parts = _split_components("pivot [m]", point)
+        away = [i for i, part in enumerate(parts) if concrete_or_none(part) is None or np.any(concrete_or_none(part))]
         point = jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
         if self.axes is None and len(away) <= 1:
             square = self.mass * dot(point, point)
@@ -82,7 +82,7 @@ class Inertia(eqx.Module):
             body = of_tensor(self.mass, self.tensor + shift_inertia(*read_on_host("pivot", self.mass, point)))
         return eqx.tree_at(lambda body: body.arm, body, -point, is_leaf=lambda leaf: leaf is None)
 
-    def checked(self, lanes: tuple[int, ...], dtype: Any) -> "Inertia":
+    def validate(self, lanes: tuple[int, ...], dtype: Any) -> "Inertia":
         """The inertia of bodies in lanes of this shape, its numbers in this dtype; a ValueError where they do not fit."""
         for name, width in (("mass", ()), ("principal", (3,)), ("axes", (4,)), ("arm", (3,))):
             array = getattr(self, name)
@@ -93,7 +93,7 @@ class Inertia(eqx.Module):
             lambda i: (i.mass, i.principal, i.axes, i.arm), self, numbers, is_leaf=lambda leaf: leaf is None
         )
 
-    def hung(self, pivot: Float[Array, "*lanes 3"]) -> "Inertia":
+    def place_pivot(self, pivot: Float[Array, "*lanes 3"]) -> "Inertia":
         """The inertia with its pivot at a place of the world [m]."""
         return eqx.tree_at(lambda i: i.pivot, self, pivot, is_leaf=lambda leaf: leaf is None)
 
@@ -121,11 +121,11 @@ def box(mass: ArrayLike, size: ArrayLike) -> Inertia:
         >>> inertia.box(12.0, (1.0, 2.0, 3.0)).principal.tolist()
         [13.0, 10.0, 5.0]
     """
-    size = real_quantity("size [m]", size, above=0.0)
+    size = as_real_quantity("size [m]", size, above=0.0)
     if size.shape[-1:] != (3,):
         raise ValueError(f"size [m]: got the shape {size.shape}, expected three edges, (3,) or (*lanes, 3).")
     a, b, c = jnp.moveaxis(size**2, -1, 0)
-    return _of_shape(mass, 1 / 12, b + c, c + a, a + b)
+    return _build_inertia(mass, 1 / 12, b + c, c + a, a + b)
 
 
 def sphere(mass: ArrayLike, radius: ArrayLike, *, hollow: bool = False) -> Inertia:
@@ -135,8 +135,8 @@ def sphere(mass: ArrayLike, radius: ArrayLike, *, hollow: bool = False) -> Inert
         >>> inertia.sphere(5.0, radius=2.0).principal.tolist()
         [8.0, 8.0, 8.0]
     """
-    square = real_quantity("radius [m]", radius, above=0.0) ** 2
-    return _of_shape(mass, 2 / 3 if hollow else 2 / 5, square, square, square)
+    square = as_real_quantity("radius [m]", radius, above=0.0) ** 2
+    return _build_inertia(mass, 2 / 3 if hollow else 2 / 5, square, square, square)
 
 
 def cylinder(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
@@ -146,8 +146,11 @@ def cylinder(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int
         >>> inertia.cylinder(12.0, radius=1.0, length=3.0).principal.tolist()
         [12.0, 12.0, 6.0]
     """
-    radius, length = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)
-    return _along(mass, axis, radius**2 / 2, (3 * radius**2 + length**2) / 12)
+    radius, length = (
+        as_real_quantity("radius [m]", radius, above=0.0),
+        as_real_quantity("length [m]", length, above=0.0),
+    )
+    return _build_axial(mass, axis, radius**2 / 2, (3 * radius**2 + length**2) / 12)
 
 
 def rod(mass: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
@@ -157,8 +160,8 @@ def rod(mass: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
         >>> inertia.rod(3.0, length=2.0).principal.tolist()
         [1.0, 1.0, 0.0]
     """
-    length = real_quantity("length [m]", length, above=0.0)
-    return _along(mass, axis, 0.0 * length, length**2 / 12)
+    length = as_real_quantity("length [m]", length, above=0.0)
+    return _build_axial(mass, axis, 0.0 * length, length**2 / 12)
 
 
 def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
@@ -171,11 +174,11 @@ def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int 
         >>> print(inertia.capsule(7.0, radius=1.0, length=1.0).principal)
         [5.1 5.1 3.1]
     """
-    r, l = real_quantity("radius [m]", radius, above=0.0), real_quantity("length [m]", length, above=0.0)  # noqa: E741
+    r, l = as_real_quantity("radius [m]", radius, above=0.0), as_real_quantity("length [m]", length, above=0.0)  # noqa: E741
     s = 4 * r / (3 * l + 4 * r)
     about = (1 - s) * r**2 / 2 + s * 2 * r**2 / 5
     across = (1 - s) * (3 * r**2 + l**2) / 12 + s * (2 * r**2 / 5 + l**2 / 4 + 3 * l * r / 8)
-    return _along(mass, axis, about, across)
+    return _build_axial(mass, axis, about, across)
 
 
 # by the full tensor
@@ -213,7 +216,7 @@ def points(masses: ArrayLike, positions: ArrayLike) -> Solid:
         >>> print(np.sort(inertia.points(np.ones(4), cross).inertia.principal))
         [ 2.  8. 10.]
     """
-    masses, positions = read_on_host("points", real_quantity("masses [kg]", masses, above=0.0), positions)
+    masses, positions = read_on_host("points", as_real_quantity("masses [kg]", masses, above=0.0), positions)
     if positions.ndim != 2 or positions.shape != (masses.size, 3) or masses.ndim != 1:
         raise ValueError(
             f"points: got masses {masses.shape} and positions {positions.shape}, expected (n,) and (n, 3)."
@@ -236,7 +239,7 @@ def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float
     """
     if (mass is None) == (density is None):
         raise ValueError("mesh: expected either mass= [kg] or density= [kg/m³].")
-    vertices, faces = checked_mesh(vertices, faces)
+    vertices, faces = check_mesh(vertices, faces)
     demand_closed(faces)
     middle = vertices.mean(axis=0)
     a, b, c = (vertices[faces[:, i]] - middle for i in range(3))
@@ -248,7 +251,7 @@ def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float
     center = np.sum(volume[:, None] * edges[3], axis=0) / (4 * whole)
     second = np.sum(volume[:, None, None] / 20 * np.sum(edges[..., :, None] * edges[..., None, :], axis=0), axis=0)
     mass = abs(whole) * density if mass is None else mass
-    (heavy,) = read_on_host("mass", real_quantity("mass [kg]", mass, above=0.0))
+    (heavy,) = read_on_host("mass", as_real_quantity("mass [kg]", mass, above=0.0))
     second = heavy * (second / whole - center[:, None] * center)
     return Solid(of_tensor(heavy, np.trace(second) * np.eye(3) - second), middle + center)
 
@@ -272,7 +275,7 @@ def composite(parts: Any) -> Solid:
     center = np.sum(masses[:, None] * positions, axis=0) / masses.sum()
     whole = shift_inertia(masses, positions - center).sum(axis=0)
     for body, _, orientation in parts:
-        (q,) = read_on_host("orientation", real_turn("orientation", orientation))
+        (q,) = read_on_host("orientation", check_quaternion("orientation", orientation))
         whole = whole + turn_tensor(q, body.tensor)
     return Solid(of_tensor(masses.sum(), whole), center)
 
@@ -280,40 +283,43 @@ def composite(parts: Any) -> Solid:
 # the checks, and the host's part
 
 
-def real_turn(name: str, value: Any) -> Float[Array, "*lanes 4"]:
+def check_quaternion(name: str, value: Any) -> Float[Array, "*lanes 4"]:
     """A quaternion (w, x, y, z) brought to length 1; a ValueError for zero, which turns nothing anywhere.
 
     Example:
-        >>> print(inertia.real_turn("orientation", (3.0, 0.0, 0.0, 4.0)))
+        >>> print(inertia.check_quaternion("orientation", (3.0, 0.0, 0.0, 4.0)))
         [0.6 0.  0.  0.8]
     """
-    q = real_quantity(name, value)
+    q = as_real_quantity(name, value)
     if q.shape[-1:] != (4,):
         raise ValueError(f"{name}: got shape {q.shape}, expected a quaternion (w, x, y, z), (4,) or (*lanes, 4).")
-    if concrete(q) is not None:
-        demand(
-            name, q, np.any(concrete(q) != 0, axis=-1, keepdims=True) | np.zeros(q.shape, bool), "a quaternion not zero"
+    if concrete_or_none(q) is not None:
+        demand_all(
+            name,
+            q,
+            np.any(concrete_or_none(q) != 0, axis=-1, keepdims=True) | np.zeros(q.shape, bool),
+            "a quaternion not zero",
         )
     return scale(1 / jnp.sqrt(dot(q, q)), q)
 
 
-def _components(name: str, vector: Any) -> list[Array]:
+def _split_components(name: str, vector: Any) -> list[Array]:
     """The components of a vector one by one; written as a tuple of three, each may be traced or not."""
     if isinstance(vector, list | tuple) and not isinstance(vector[0], list | tuple):
-        parts = [real_quantity(name, part) for part in vector]
+        parts = [as_real_quantity(name, part) for part in vector]
     else:
-        parts = components(real_quantity(name, vector))
+        parts = components(as_real_quantity(name, vector))
     if len(parts) != 3:
         raise ValueError(f"{name}: got {len(parts)} components, expected 3.")
     return parts
 
 
-def _real_moments(value: Any) -> Float[Array, "*lanes 3"]:
+def _check_moments(value: Any) -> Float[Array, "*lanes 3"]:
     """Principal moments that a body can have: none negative, none greater than the sum of the others."""
-    principal = real_quantity("principal moments [kg m²]", value, at_least=0.0)
+    principal = as_real_quantity("principal moments [kg m²]", value, at_least=0.0)
     if principal.shape[-1:] != (3,):
         raise ValueError(f"principal moments [kg m²]: got shape {principal.shape}, expected (3,) or (*lanes, 3).")
-    values = concrete(principal)
+    values = concrete_or_none(principal)
     if values is not None:
         rounding = 1 + 64 * np.finfo(values.dtype).eps
         good = (2 * values.max(axis=-1) <= rounding * values.sum(axis=-1)) & (values.max(axis=-1) > 0)
@@ -325,8 +331,8 @@ def _real_moments(value: Any) -> Float[Array, "*lanes 3"]:
     return principal
 
 
-def _of_shape(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
-    mass = real_quantity("mass [kg]", mass, above=0.0)
+def _build_inertia(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
+    mass = as_real_quantity("mass [kg]", mass, above=0.0)
     return Inertia(
         mass,
         scale(factor * mass, jnp.stack(moments, axis=-1))
@@ -335,13 +341,13 @@ def _of_shape(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
     )
 
 
-def _along(mass: ArrayLike, axis: int, about: Array, across: Array) -> Inertia:
+def _build_axial(mass: ArrayLike, axis: int, about: Array, across: Array) -> Inertia:
     """Moments for a kilogram about an axis of the body and across it."""
     if axis not in (0, 1, 2):
         raise ValueError(
             f"axis: got {axis!r}, expected 0, 1 or 2: the axis of the body's frame that the shape is along."
         )
-    return _of_shape(mass, 1.0, *(about if i == axis else across for i in range(3)))
+    return _build_inertia(mass, 1.0, *(about if i == axis else across for i in range(3)))
 
 
 __all__ = [

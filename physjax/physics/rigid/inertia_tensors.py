@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from numpy.linalg import eigh
 
-from physjax.checks import concrete
+from physjax.checks import concrete_or_none
 
 
 def read_on_host(name: str, *values: Any) -> list[np.ndarray]:
     """The values in double precision; a TypeError where one is being traced."""
-    arrays = [concrete(value) for value in values]
+    arrays = [concrete_or_none(value) for value in values]
     if any(array is None for array in arrays):
         raise TypeError(
             f"{name}: is being traced, but a full tensor is diagonalised before compiling. Build it outside, or give "

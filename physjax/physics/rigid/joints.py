@@ -8,9 +8,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import declared, quantity, real_quantity
+from physjax.checks import as_real_quantity, quantity, unchecked_quantity
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity, in_world
+from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity, to_world_frame
 from physjax.vectors import cross, dot, norm, scale
 
 
@@ -29,14 +29,14 @@ class Joints(Load):
     """
 
     couples: ClassVar[bool] = True
-    points: Float[Array, "joints 2 3"] = declared("points of the joints", "m", kind="place", per=None)
+    points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", per="joint", above=0)
     damping: Float[Array, "..."] = quantity("damping c", "kg/s", per="joint", at_least=0)
 
     def __init__(self, pairs: Any, points: Any, stiffness: Any, damping: Any = 0.0):
         pairs = np.asarray(pairs)
-        self.points = real_quantity("points of the joints [m]", points)
+        self.points = as_real_quantity("points of the joints [m]", points)
         whole = pairs.dtype.kind in "iu" and pairs.ndim == 2 and pairs.shape[1:] == (2,) and pairs.size
         if not whole or (pairs < 0).any() or (pairs[:, 0] == pairs[:, 1]).any():
             raise ValueError(f"Joints: got pairs {pairs.tolist()}, expected (joints, 2) indices of different bodies.")
@@ -45,44 +45,44 @@ class Joints(Load):
                 f"Joints: got points {self.points.shape}, expected {(len(pairs), 2, 3)}: one on each body."
             )
         self.pairs = tuple((int(i), int(j)) for i, j in pairs)
-        self.stiffness = real_quantity("stiffness k [N/m]", stiffness, above=0.0)
-        self.damping = real_quantity("damping c [kg/s]", damping, at_least=0.0)
+        self.stiffness = as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
+        self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """Forces and torques on all bodies, equal and opposite at each joint."""
-        arms, apart = self._arms(bodies)
-        straight = self._ends(scale(1 / inertia.mass, bodies.momentum))
-        turning = self._ends(angular_velocity(bodies, inertia))
+        arms, apart = self._locate_arms(bodies)
+        straight = self._take_ends(scale(1 / inertia.mass, bodies.momentum))
+        turning = self._take_ends(angular_velocity(bodies, inertia))
         fast = [v + cross(omega, arm) for v, omega, arm in zip(straight, turning, arms, strict=True)]
         pull = self.stiffness * apart + self.damping * (fast[1] - fast[0])
         forces = jnp.concatenate([pull, -pull], axis=-2)
         torques = jnp.concatenate([cross(arms[0], pull), cross(arms[1], -pull)], axis=-2)
-        return Wrench(self._gathered(forces, bodies), self._gathered(torques, bodies))
+        return Wrench(self._sum_by_body(forces, bodies), self._sum_by_body(torques, bodies))
 
     def potential(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes"]:
         """½k d² [J], halved between the two bodies."""
-        _, apart = self._arms(bodies)
+        _, apart = self._locate_arms(bodies)
         half = 0.25 * self.stiffness * dot(apart, apart)
         shares = jnp.concatenate([half, half], axis=-1)[..., None]
-        return self._gathered(shares, bodies)[..., 0]
+        return self._sum_by_body(shares, bodies)[..., 0]
 
     def error(self, bodies: RigidBodies) -> Float[Array, "*scenes joints"]:
         """How far the two points of each joint are apart [m]."""
-        return norm(self._arms(bodies)[1])
+        return norm(self._locate_arms(bodies)[1])
 
-    def _arms(self, bodies: RigidBodies) -> tuple[list[Array], Array]:
+    def _locate_arms(self, bodies: RigidBodies) -> tuple[list[Array], Array]:
         """From the centres of mass to the points of each joint, and from its first point to its second."""
-        places = [self._ends(part) for part in (bodies.position, bodies.orientation)]
+        places = [self._take_ends(part) for part in (bodies.position, bodies.orientation)]
         arms = []
         for side, (position, orientation) in enumerate(zip(*places, strict=True)):
             ends = RigidBodies(position, orientation, position, position)
-            arms.append(in_world(ends, jnp.broadcast_to(self.points[:, side], position.shape)))
+            arms.append(to_world_frame(ends, jnp.broadcast_to(self.points[:, side], position.shape)))
         return arms, places[0][1] + arms[1] - places[0][0] - arms[0]
 
-    def _ends(self, part: Array) -> list[Array]:
+    def _take_ends(self, part: Array) -> list[Array]:
         return [jnp.take(part, np.array([pair[side] for pair in self.pairs]), axis=-2) for side in (0, 1)]
 
-    def _gathered(self, ends: Array, bodies: RigidBodies) -> Array:
+    def _sum_by_body(self, ends: Array, bodies: RigidBodies) -> Array:
         """What acts on the ends of joints, first ones then second ones, summed up body by body: gathered, not scattered."""
         bodies_of = np.asarray(self.pairs).T.ravel()
         nodes = bodies.lanes[-1]

@@ -7,7 +7,7 @@
 
 Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
 inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
-`Hull`; `contacts=(Touch(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
+`ContactPoints`; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
 """
 
 from collections.abc import Callable
@@ -18,11 +18,11 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity, real_quantity
+from physjax.checks import as_real_quantity, quantity
 from physjax.loops import Time
 from physjax.particles import Particles
 from physjax.parts import Force, as_module
-from physjax.physics.rigid.inertia import Inertia, real_turn
+from physjax.physics.rigid.inertia import Inertia, check_quaternion
 from physjax.physics.rigid.spatial import (
     Load,
     OnBodies,
@@ -30,10 +30,10 @@ from physjax.physics.rigid.spatial import (
     Wrench,
     angular_acceleration,
     angular_velocity,
-    in_world,
+    to_world_frame,
 )
 from physjax.scene import Scene
-from physjax.vectors import cross, over, scale, turn, turn_back
+from physjax.vectors import broadcast_vector, cross, rotate_vector, rotate_vector_back, scale
 
 
 def bodies(
@@ -58,19 +58,21 @@ def bodies(
     """
     _demand_frame(frame)
     named = {"position [m]": position, "velocity [m/s]": velocity, "angular velocity [rad/s]": angular_velocity}
-    x, v, omega = (real_quantity(name, value) for name, value in named.items())
-    q = real_turn("orientation", orientation)
+    x, v, omega = (as_real_quantity(name, value) for name, value in named.items())
+    q = check_quaternion("orientation", orientation)
     if any(a.shape[-1:] != (3,) for a in (x, v, omega)):
         raise ValueError(f"bodies: got vectors of shapes {x.shape}, {v.shape}, {omega.shape}, expected (*lanes, 3).")
     parts = (x[..., 0], v[..., 0], omega[..., 0], q[..., 0], inertia.mass, inertia.principal[..., 0])
     lanes, dtype = jnp.broadcast_shapes(*(part.shape for part in parts)), x.dtype
     x, v, omega, q = (jnp.broadcast_to(a, (*lanes, a.shape[-1])).astype(dtype) for a in (x, v, omega, q))
-    inertia = inertia.checked(lanes, dtype)
-    omega = omega if frame == "body" else turn_back(q, omega)
-    axes = None if inertia.axes is None else over(inertia.axes, q)
-    along = omega if axes is None else turn_back(axes, omega)
-    spin = over(inertia.principal, omega) * along
-    return RigidBodies(x, q, scale(inertia.mass, v), turn(q, spin if axes is None else turn(axes, spin)))
+    inertia = inertia.validate(lanes, dtype)
+    omega = omega if frame == "body" else rotate_vector_back(q, omega)
+    axes = None if inertia.axes is None else broadcast_vector(inertia.axes, q)
+    along = omega if axes is None else rotate_vector_back(axes, omega)
+    spin = broadcast_vector(inertia.principal, omega) * along
+    return RigidBodies(
+        x, q, scale(inertia.mass, v), rotate_vector(q, spin if axes is None else rotate_vector(axes, spin))
+    )
 
 
 def on_bodies(function: Callable, *, couples: bool = False) -> Load:
@@ -94,7 +96,7 @@ def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
         >>> print(rigid.point(body, (0.5, 0.0, 0.0)))
         [0.5 0.  0. ]
     """
-    return bodies.position + in_world(bodies, place)
+    return bodies.position + to_world_frame(bodies, place)
 
 
 def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> Float[Array, "*lanes 3"]:
@@ -104,7 +106,9 @@ def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> F
         >>> print(rigid.point_velocity(body, brick, (0.5, 0.0, 0.0)))
         [1. 1. 0.]
     """
-    return scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), in_world(bodies, place))
+    return scale(1 / inertia.mass, bodies.momentum) + cross(
+        angular_velocity(bodies, inertia), to_world_frame(bodies, place)
+    )
 
 
 def point_acceleration(
@@ -117,7 +121,7 @@ def point_acceleration(
         [-2.  0.  0.]
     """
     state = scene.state if state is None else state
-    rate, r = scene.rate(t, state), in_world(state, place)
+    rate, r = scene.rate(t, state), to_world_frame(state, place)
     omega, change = angular_velocity(state, scene.mass), angular_acceleration(state, scene.mass, rate.angular_momentum)
     return scale(1 / scene.mass.mass, rate.momentum) + cross(change, r) + cross(omega, cross(omega, r))
 
@@ -142,7 +146,9 @@ class Torque(Load):
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """No force, the torque."""
         world = self.frame == "world"
-        return Wrench(torque=over(self.torque, bodies.position) if world else in_world(bodies, self.torque))
+        return Wrench(
+            torque=broadcast_vector(self.torque, bodies.position) if world else to_world_frame(bodies, self.torque)
+        )
 
 
 class RotationalDrag(Load):
@@ -175,8 +181,8 @@ class Thrust(Load):
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
-        force = in_world(bodies, self.force)
-        return Wrench(force, cross(in_world(bodies, self.point), force))
+        force = to_world_frame(bodies, self.force)
+        return Wrench(force, cross(to_world_frame(bodies, self.point), force))
 
 
 class AtPoint(Load):
@@ -215,9 +221,9 @@ class AtPoint(Load):
         return self.force.discontinuities
 
     @property
-    def during(self) -> Callable:
+    def averaged_over_step(self) -> Callable:
         """The mean of the force over a step, where it has one; it looks at when, not at how fast."""
-        mean = self.force.during
+        mean = self.force.averaged_over_step
 
         def placed(t, dt, bodies):
             where = point(bodies, self.point)
@@ -229,14 +235,14 @@ class AtPoint(Load):
     def potential(self) -> Callable:
         """Its energy [J], where it has one."""
         energy = self.force.potential
-        return lambda t, bodies, inertia: energy(t, self._seen(bodies, inertia), inertia.mass)
+        return lambda t, bodies, inertia: energy(t, self._build_point_particles(bodies, inertia), inertia.mass)
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
-        force = self.force(t, self._seen(bodies, inertia), inertia.mass)
-        return Wrench(force, cross(in_world(bodies, self.point), force))
+        force = self.force(t, self._build_point_particles(bodies, inertia), inertia.mass)
+        return Wrench(force, cross(to_world_frame(bodies, self.point), force))
 
-    def _seen(self, bodies: RigidBodies, inertia: Inertia) -> Particles:
+    def _build_point_particles(self, bodies: RigidBodies, inertia: Inertia) -> Particles:
         return Particles(point(bodies, self.point), point_velocity(bodies, inertia, self.point))
 
 

@@ -10,16 +10,16 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.backend import any_lane
-from physjax.checks import concrete, demand_legal, quantity
+from physjax.checks import concrete_or_none, demand_start_outside, quantity
 from physjax.parts import Contact
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.vectors import cross, dot, norm, scale, unit
 
-ROUNDS = 16
+MAX_PAIR_PASSES = 16
 """Most passes over all pairs in a step: a push goes through a row of so many balls."""
-MOST = 64
+MAX_BALLS = 64
 """Balls in one scene: their pairs are looked at one by one."""
 
 
@@ -49,14 +49,14 @@ class Balls(Contact):
         """Raise a TypeError for a state that is not of rigid bodies, a ValueError for what are not balls side by side."""
         if not isinstance(state, RigidBodies):
             raise TypeError(f"Balls: got a state of type {type(state).__name__}, expected RigidBodies.")
-        if len(state.lanes) < 1 or not 2 <= state.lanes[-1] <= MOST:
-            raise ValueError(f"Balls: got lanes {state.lanes}, expected 2 to {MOST} balls in the last axis.")
-        demand_legal(self, state)
-        moments = concrete(mass.principal)
+        if len(state.lanes) < 1 or not 2 <= state.lanes[-1] <= MAX_BALLS:
+            raise ValueError(f"Balls: got lanes {state.lanes}, expected 2 to {MAX_BALLS} balls in the last axis.")
+        demand_start_outside(self, state)
+        moments = concrete_or_none(mass.principal)
         if moments is not None and np.ptp(moments, axis=-1).max() > 1e-6 * moments.max():
             raise ValueError("Balls: got bodies with different principal moments, expected inertia.sphere.")
 
-    def gap(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
         """Distance of each ball to its nearest neighbour [m]."""
         apart = norm(position[..., :, None, :] - position[..., None, :, :])
         radius = jnp.broadcast_to(self.radius, position.shape[:-1])
@@ -65,14 +65,16 @@ class Balls(Contact):
         return jnp.min(jnp.where(itself, jnp.inf, apart), axis=-1)
 
     def respond(self, t: ArrayLike, state: RigidBodies) -> RigidBodies:
-        """The balls as they are: what they do to each other needs their masses; see `answered`."""
+        """The balls as they are: what they do to each other needs their masses; see `resolve`."""
         return state
 
-    def answered(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> RigidBodies:
+    def resolve(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> RigidBodies:
         """The balls after all impacts of a step."""
 
         def sweep(state):
-            after, _ = lax.scan(lambda state, pair: (self._met(state, mass, pair), None), state, self._pairs(state))
+            after, _ = lax.scan(
+                lambda state, pair: (self._resolve_pair(state, mass, pair), None), state, self._build_pair_masks(state)
+            )
             return after
 
         def go_on(carry, _):
@@ -81,14 +83,16 @@ class Balls(Contact):
             changed = jnp.any(after.momentum != state.momentum) | jnp.any(after.position != state.position)
             return (after, changed), None
 
-        return lax.scan(go_on, (state, jnp.any(self.gap(t, state.position) < 0)), length=ROUNDS)[0][0]
+        return lax.scan(go_on, (state, jnp.any(self.signed_distance(t, state.position) < 0)), length=MAX_PAIR_PASSES)[
+            0
+        ][0]
 
-    def _pairs(self, state: RigidBodies) -> Array:
+    def _build_pair_masks(self, state: RigidBodies) -> Array:
         """Of each pair, which lanes its two balls are in: `(pairs, 2, nodes)`, ones and zeros."""
         nodes = state.lanes[-1]
         return jnp.asarray(np.eye(nodes)[list(combinations(range(nodes), 2))], state.dtype)
 
-    def _met(self, state: RigidBodies, mass: Inertia, pair: Array) -> RigidBodies:
+    def _resolve_pair(self, state: RigidBodies, mass: Inertia, pair: Array) -> RigidBodies:
         """A pair after its impact, if there is one."""
         x, _, p, spin = state
         ends = [end.reshape((1,) * (x.ndim - 2) + end.shape) for end in pair]
@@ -97,27 +101,30 @@ class Balls(Contact):
         ]
         of = lambda vector: [jnp.sum(end[..., None] * vector, axis=-2) for end in ends]  # noqa: E731
         radius, restitution = own(self.radius), sum(own(self.restitution)) / 2
-        lightness, ease = own(1 / mass.mass), own(mass.inverse[..., 0])
+        inverse_masses, inverse_inertias = own(1 / mass.mass), own(mass.inverse[..., 0])
         (a, b), (pa, pb), (sa, sb) = of(x), of(p), of(spin)
         line, normal = b - a, unit(b - a)
         depth = jnp.minimum(norm(line) - radius[0] - radius[1], 0.0)
         arms = [scale(radius[0], normal), scale(-radius[1], normal)]
         speeds = [
             scale(w, momentum) + cross(scale(i, s), arm)
-            for w, momentum, i, s, arm in zip(lightness, (pa, pb), ease, (sa, sb), arms, strict=True)
+            for w, momentum, i, s, arm in zip(inverse_masses, (pa, pb), inverse_inertias, (sa, sb), arms, strict=True)
         ]
         u = speeds[1] - speeds[0]
         inward = jnp.where(depth < 0, jnp.minimum(dot(u, normal), 0.0), 0.0)
-        light = lightness[0] + lightness[1]
+        light = inverse_masses[0] + inverse_masses[1]
         push = -(1 + restitution) * inward / light
         impulse = scale(push, normal)
         if self.coulomb is not None:
             slip = u - scale(dot(u, normal), normal)
-            size, stiff = norm(slip), light + ease[0] * radius[0] ** 2 + ease[1] * radius[1] ** 2
+            size, stiff = (
+                norm(slip),
+                light + inverse_inertias[0] * radius[0] ** 2 + inverse_inertias[1] * radius[1] ** 2,
+            )
             most = sum(own(self.coulomb.kinetic)) / 2 * push
             share = jnp.where(size > stiff * most, most / jnp.where(size > 0, size, 1.0), 1 / stiff)
             impulse = impulse - scale(jnp.where(inward < 0, share, 0.0), slip)
-        for end, arm, sign, w in zip(ends, arms, (-1.0, 1.0), lightness, strict=True):
+        for end, arm, sign, w in zip(ends, arms, (-1.0, 1.0), inverse_masses, strict=True):
             give = lambda vector, end=end: end[..., None] * vector[..., None, :]  # noqa: E731
             p = p + sign * give(impulse)
             spin = spin + sign * give(cross(arm, impulse))

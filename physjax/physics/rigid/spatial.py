@@ -15,24 +15,24 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import kept_apart
-from physjax.checks import real_array, real_quantity
-from physjax.loops import Time, told
-from physjax.particles import Particles, added, shaped
+from physjax.backend import materialise
+from physjax.checks import as_real_array, as_real_quantity
+from physjax.loops import Time, time_for_part
+from physjax.particles import Particles, check_load_shape, sum_terms
 from physjax.parts import Force, Function
-from physjax.physics.rigid.inertia import Inertia, real_turn
+from physjax.physics.rigid.inertia import Inertia, check_quaternion
 from physjax.scene import loads
 from physjax.vectors import (
+    broadcast_vector,
     components,
-    composed,
+    conjugate_quaternion,
     cross,
     dot,
-    over,
-    reverse,
+    multiply_quaternions,
+    rotate_components,
+    rotate_vector,
     scale,
-    stacked,
-    turn,
-    turned,
+    stack_components,
 )
 
 
@@ -120,25 +120,25 @@ class RigidBodies(NamedTuple):
 
     # loads
 
-    def shown_to(self, force: Any, mass: Inertia) -> tuple[Any, Any]:
+    def view_for_force(self, force: Any, mass: Inertia) -> tuple[Any, Any]:
         """What a force sees: a load the bodies and their inertia, any other particles at the centres of mass."""
         if isinstance(force, Load):
             return self, mass
         return Particles(self.position, scale(1 / mass.mass, self.momentum)), mass.mass
 
-    def load(self, force: Any, t: Time, mass: Inertia) -> Wrench:
+    def evaluate_load(self, force: Any, t: Time, mass: Inertia) -> Wrench:
         """What a force does to each body: a wrench, or a force at the centre of mass."""
-        found = force(told(force, t), *self.shown_to(force, mass))
+        found = force(time_for_part(force, t), *self.view_for_force(force, mass))
         found = found if isinstance(found, Wrench) else Wrench(found)
-        return Wrench(*(None if part is None else shaped(force, part, self.position) for part in found))
+        return Wrench(*(None if part is None else check_load_shape(force, part, self.position) for part in found))
 
-    def total(self, terms: Any) -> Wrench:
+    def sum_loads(self, terms: Any) -> Wrench:
         """The sum of wrenches, both parts present."""
         kinds = zip(*terms, strict=True) if terms else ((), ())
         present = ([part for part in parts if part is not None] for parts in kinds)
-        return Wrench(*(added(parts) if parts else jnp.zeros_like(self.position) for parts in present))
+        return Wrench(*(sum_terms(parts) if parts else jnp.zeros_like(self.position) for parts in present))
 
-    def driven(self, scene: Any, t: Time) -> Wrench:
+    def generalised_force(self, scene: Any, t: Time) -> Wrench:
         """Total force and torque; none on bodies that are held."""
         total = loads(scene, t, self.on_pivot(scene.mass))
         if scene.held is None:
@@ -151,11 +151,11 @@ class RigidBodies(NamedTuple):
     def rate(self, wrench: Wrench, inertia: Inertia) -> "RigidBodies":
         """Time derivative: x' = p/m, q' = ½(0, ω)q, p' = F, L' = τ; on a pivot what follows from turning about it."""
         force, torque = wrench
-        turning = _turning(self, inertia)
+        turning = _orientation_rate(self, inertia)
         if inertia.arm is None:
             return RigidBodies(scale(1 / inertia.mass, self.momentum), turning, force, torque)
         omega = angular_velocity(self, inertia)
-        arm = in_world(self, inertia.arm)
+        arm = to_world_frame(self, inertia.arm)
         torque = torque + cross(arm, force)
         velocity = cross(omega, arm)
         change = angular_acceleration(self, inertia, torque)
@@ -172,9 +172,9 @@ class RigidBodies(NamedTuple):
     def drift(self, dt: ArrayLike, inertia: Inertia) -> "RigidBodies":
         """x += p/m dt, and the free turn of a time dt, both momenta untouched."""
         position = self.position + scale(dt, scale(1 / inertia.mass, self.momentum))
-        return self._replace(position=position, orientation=free_turn(self, inertia, dt)).on_pivot(inertia)
+        return self._replace(position=position, orientation=rotate_freely(self, inertia, dt)).on_pivot(inertia)
 
-    def held(self, free: Float[Array, "*lanes"]) -> "RigidBodies":
+    def hold_lanes(self, free: Float[Array, "*lanes"]) -> "RigidBodies":
         """The state with both momenta of held bodies (free = 0) set to zero."""
         return self._replace(momentum=scale(free, self.momentum), angular_momentum=scale(free, self.angular_momentum))
 
@@ -182,11 +182,13 @@ class RigidBodies(NamedTuple):
         """The state with position and momentum as orientation and angular momentum say, where there is a pivot."""
         if inertia.arm is None:
             return self
-        arm = in_world(self, inertia.arm)
+        arm = to_world_frame(self, inertia.arm)
         velocity = cross(angular_velocity(self, inertia), arm)
-        return self._replace(position=over(inertia.pivot, self.position) + arm, momentum=scale(inertia.mass, velocity))
+        return self._replace(
+            position=broadcast_vector(inertia.pivot, self.position) + arm, momentum=scale(inertia.mass, velocity)
+        )
 
-    def settled(self, inertia: Inertia) -> "RigidBodies":
+    def normalised(self, inertia: Inertia) -> "RigidBodies":
         """The state with the orientation of length 1, and on its pivot, where there is one.
 
         Done at the end of a step and not in its stages, which keeps every method's order.
@@ -209,18 +211,18 @@ class RigidBodies(NamedTuple):
         """Angular momentum about the centre of mass [kg m²/s], also where the state's own is about a pivot."""
         if inertia.arm is None:
             return self.angular_momentum
-        arm = in_world(self, inertia.arm)
+        arm = to_world_frame(self, inertia.arm)
         return self.angular_momentum - cross(arm, self.momentum)
 
     # checks
 
-    def checked(self, mass: Any) -> tuple["RigidBodies", Inertia]:
+    def validate(self, mass: Any) -> tuple["RigidBodies", Inertia]:
         """State and inertia as arrays of one dtype that fit; ValueError or TypeError in plain words otherwise."""
         if not isinstance(mass, Inertia):
             raise TypeError(
                 f"mass: got {type(mass).__name__}, expected an Inertia for rigid bodies, e.g. inertia.box(2.0, (1, 2, 3))."
             )
-        state = RigidBodies(*(real_array(name, a) for name, a in zip(self._fields, self, strict=True)))
+        state = RigidBodies(*(as_real_array(name, a) for name, a in zip(self._fields, self, strict=True)))
         lanes, dtype = state.lanes, state.dtype
         for name, array in state._asdict().items():
             expected = (*lanes, 4 if name == "orientation" else 3)
@@ -231,22 +233,22 @@ class RigidBodies(NamedTuple):
                 )
             if array.dtype != dtype:
                 raise TypeError(f"RigidBodies: got {name} of {array.dtype}, expected {dtype} like position. Cast it.")
-            real_quantity(f"{name}", array)
+            as_real_quantity(f"{name}", array)
         state = RigidBodies(*(a.astype(dtype) for a in state))
-        state = state._replace(orientation=real_turn("orientation", state.orientation))
-        inertia = mass.checked(lanes, dtype)
+        state = state._replace(orientation=check_quaternion("orientation", state.orientation))
+        inertia = mass.validate(lanes, dtype)
         if inertia.arm is not None:
-            pivot = state.position - in_world(state, inertia.arm)
-            inertia = inertia.hung(pivot)
+            pivot = state.position - to_world_frame(state, inertia.arm)
+            inertia = inertia.place_pivot(pivot)
         return state.on_pivot(inertia), inertia
 
 
 # how bodies turn
 
 
-def in_world(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]:
+def to_world_frame(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]:
     """A vector of each body's frame, one for all or one per lane, in the world's frame: R v."""
-    return turn(bodies.orientation, over(jnp.asarray(vector, bodies.dtype), bodies.position))
+    return rotate_vector(bodies.orientation, broadcast_vector(jnp.asarray(vector, bodies.dtype), bodies.position))
 
 
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
@@ -256,7 +258,7 @@ def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*la
         >>> print(rigid.angular_velocity(body, brick))
         [0. 0. 2.]
     """
-    return answer(bodies, inertia, bodies.angular_momentum)
+    return apply_inverse_inertia(bodies, inertia, bodies.angular_momentum)
 
 
 def angular_acceleration(
@@ -269,10 +271,10 @@ def angular_acceleration(
         [0. 0. 2.]
     """
     gyroscopic = cross(angular_velocity(bodies, inertia), bodies.angular_momentum)
-    return answer(bodies, inertia, torque - gyroscopic)
+    return apply_inverse_inertia(bodies, inertia, torque - gyroscopic)
 
 
-def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
+def rotate_freely(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
     """The orientation after turning freely for a time dt [s], to second order, with L constant.
 
     The turns about the principal axes that ½ℓᵢ²/Iᵢ alone would make (ℓ the angular momentum seen from the body), each in
@@ -280,8 +282,8 @@ def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Arr
     is gained or lost in the long run (R. McLachlan 1993, S. Reich 1994).
     """
     w, *v = _principal_frame(bodies, inertia)
-    spin = turned(reverse([w, *v]), components(bodies.angular_momentum))
-    inverse = components(over(inertia.inverse, bodies.angular_momentum))
+    spin = rotate_components(conjugate_quaternion([w, *v]), components(bodies.angular_momentum))
+    inverse = components(broadcast_vector(inertia.inverse, bodies.angular_momentum))
     for i, share in ((0, 0.25), (1, 0.25), (2, 0.5), (1, 0.25), (0, 0.25)):
         j, k = (i + 1) % 3, (i + 2) % 3
         c, s = _cosine_and_sine(scale(dt, share * inverse[i] * spin[i]), dt)
@@ -293,36 +295,46 @@ def free_turn(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Arr
 
 def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
     # kept apart: XLA on CPU would compute them again for each of the many that are made of them
-    return kept_apart(dt, lambda: (jnp.cos(angle), jnp.sin(angle)))
+    return materialise(dt, lambda: (jnp.cos(angle), jnp.sin(angle)))
 
 
 def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
     """The quaternion from the principal axes to the world, in components."""
     q = components(bodies.orientation)
-    return q if inertia.axes is None else composed(q, components(over(inertia.axes, bodies.orientation)))
+    return (
+        q
+        if inertia.axes is None
+        else multiply_quaternions(q, components(broadcast_vector(inertia.axes, bodies.orientation)))
+    )
 
 
 def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
     """The quaternion whose turn of the principal axes is `frame`."""
     if inertia.axes is not None:
-        frame = composed(frame, reverse(components(over(inertia.axes, bodies.orientation))))
-    return stacked(frame)
+        frame = multiply_quaternions(
+            frame, conjugate_quaternion(components(broadcast_vector(inertia.axes, bodies.orientation)))
+        )
+    return stack_components(frame)
 
 
-def _turning(bodies: RigidBodies, inertia: Inertia) -> Array:
+def _orientation_rate(bodies: RigidBodies, inertia: Inertia) -> Array:
     """q' = ½ q (0, ω), with ω seen from the body, which is cheaper than ½ (0, ω) q with ω seen from the world."""
     frame = _principal_frame(bodies, inertia)
-    x, y, z = _seen(frame, inertia, bodies.angular_momentum)
-    return _body_frame(composed(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
+    x, y, z = _apply_inverse_principal(frame, inertia, bodies.angular_momentum)
+    return _body_frame(multiply_quaternions(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
 
 
-def _seen(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
+def _apply_inverse_principal(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
     """I⁻¹ times a vector of the world, along the principal axes."""
-    parts = zip(components(over(inertia.inverse, vector)), turned(reverse(frame), components(vector)), strict=True)
+    parts = zip(
+        components(broadcast_vector(inertia.inverse, vector)),
+        rotate_components(conjugate_quaternion(frame), components(vector)),
+        strict=True,
+    )
     return [number * part for number, part in parts]
 
 
-def answer(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
+def apply_inverse_inertia(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
     """R I⁻¹ Rᵀ times a vector of the world: how a body turns in answer to an angular impulse."""
     frame = _principal_frame(bodies, inertia)
-    return stacked(turned(frame, _seen(frame, inertia, vector)))
+    return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia, vector)))

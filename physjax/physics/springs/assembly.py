@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.checks import real_quantity
+from physjax.checks import as_real_quantity
 from physjax.particles import Particles
 from physjax.physics.springs.springs import Springs
 from physjax.physics.springs.wind import Cells, Triangles, Wind
@@ -55,15 +55,15 @@ def build_lattice(x, kinds, damping, breaks_at, mass, share, sets, faces, shape,
     pairs = np.concatenate([pairs for pairs, _ in present])
     rest = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]]) * stretch
     state = Particles(jnp.asarray(x, jnp.result_type(float)), jnp.zeros(x.shape, jnp.result_type(float)))
-    mass = real_quantity("mass [kg]", mass, above=0)
-    springs = Springs(pairs, _joined(present), rest, damping, breaks_at, nodes=len(x))
+    mass = as_real_quantity("mass [kg]", mass, above=0)
+    springs = Springs(pairs, _join_stiffness(present), rest, damping, breaks_at, nodes=len(x))
     share = jnp.asarray(share / share.sum(), mass.dtype)
     return Lattice(state, mass * share, springs, sets, faces, shape)
 
 
-def _joined(kinds: list[tuple[np.ndarray, Any]]) -> Any:
+def _join_stiffness(kinds: list[tuple[np.ndarray, Any]]) -> Any:
     """The stiffness of each spring; a number alone where there is only one kind."""
-    numbers = [real_quantity("stiffness [N/m]", stiffness, at_least=0) for _, stiffness in kinds]
+    numbers = [as_real_quantity("stiffness [N/m]", stiffness, at_least=0) for _, stiffness in kinds]
     if len(kinds) == 1:
         return numbers[0]
     for number in numbers:

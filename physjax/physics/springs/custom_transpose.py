@@ -12,49 +12,49 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-_linear = Primitive("linear_with_transpose")
-_linear.multiple_results = True
+_linear_primitive = Primitive("linear_with_transpose")
+_linear_primitive.multiple_results = True
 
 
-def linear(forward: Callable, backward: Callable, arrays: tuple[Array, ...]) -> list[Array]:
+def apply_linear(forward: Callable, backward: Callable, arrays: tuple[Array, ...]) -> list[Array]:
     """`forward(*arrays)`, a list of arrays that depends linearly on them; `backward` is its transpose.
 
     Both take any leading axes and treat them alike. Neither may close over arrays that are traced.
     """
-    return _linear.bind(*arrays, forward=forward, backward=backward)
+    return _linear_primitive.bind(*arrays, forward=forward, backward=backward)
 
 
-@_linear.def_impl
-def _run(*arrays, forward, backward):
+@_linear_primitive.def_impl
+def _apply_forward(*arrays, forward, backward):
     return forward(*arrays)
 
 
-@_linear.def_abstract_eval
-def _shapes(*arrays, forward, backward):
+@_linear_primitive.def_abstract_eval
+def _infer_shapes(*arrays, forward, backward):
     shapes = jax.eval_shape(forward, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
     return [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
 
 
-def _derivative(primals, tangents, **maps):
+def _differentiate(primals, tangents, **maps):
     tangents = [ad.instantiate_zeros(t) for t in tangents]
-    return _linear.bind(*primals, **maps), _linear.bind(*tangents, **maps)
+    return _linear_primitive.bind(*primals, **maps), _linear_primitive.bind(*tangents, **maps)
 
 
 def _transpose(cotangents, *arrays, forward, backward):
-    return _linear.bind(*(ad.instantiate_zeros(c) for c in cotangents), forward=backward, backward=forward)
+    return _linear_primitive.bind(*(ad.instantiate_zeros(c) for c in cotangents), forward=backward, backward=forward)
 
 
-def _batched(arrays, axes, **maps):
+def _batch(arrays, axes, **maps):
     size = next(a.shape[i] for a, i in zip(arrays, axes, strict=True) if i is not None)
     front = [
         jnp.broadcast_to(a, (size, *a.shape)) if i is None else jnp.moveaxis(a, i, 0)
         for a, i in zip(arrays, axes, strict=True)
     ]
-    found = _linear.bind(*front, **maps)
+    found = _linear_primitive.bind(*front, **maps)
     return found, [0] * len(found)
 
 
-mlir.register_lowering(_linear, mlir.lower_fun(_run, multiple_results=True))
-ad.primitive_jvps[_linear] = _derivative
-ad.primitive_transposes[_linear] = _transpose
-batching.primitive_batchers[_linear] = _batched
+mlir.register_lowering(_linear_primitive, mlir.lower_fun(_apply_forward, multiple_results=True))
+ad.primitive_jvps[_linear_primitive] = _differentiate
+ad.primitive_transposes[_linear_primitive] = _transpose
+batching.primitive_batchers[_linear_primitive] = _batch

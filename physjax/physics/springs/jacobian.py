@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 
 from physjax.particles import Particles
 from physjax.parts import Force
-from physjax.physics.springs.topology import Network
+from physjax.physics.springs.topology import SpringTopology
 
 
-class SpringsTangent(Force):
+class LinearisedSprings(Force):
     """Springs near a state: F ≈ F₀ + Σ g u + h (d·u) d + γ (d·w) d, for ends displaced by u and faster by w.
 
     With g = k max(0, 1 - L/l) and h = (k - g)/l² this is the exact derivative of a stretched spring by position. A
@@ -23,28 +23,28 @@ class SpringsTangent(Force):
     """
 
     couples: ClassVar[bool] = True
-    definite: ClassVar[bool] = True
-    network: Network = eqx.field(static=True)
+    dissipative_symmetric: ClassVar[bool] = True
+    topology: SpringTopology = eqx.field(static=True)
     state: Particles
     force: Float[Array, "*scenes nodes dim"]
     springs: list[tuple]
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes dim"]:
         """The force [N], affine in the state."""
-        network = self.network
+        topology = self.topology
         moved = [a - b for a, b in zip(state, self.state, strict=True)]
         damped = self.springs[0][-1] is not None
-        parts = network.parts(*(moved if damped else moved[:1]))
+        parts = topology.parts(*(moved if damped else moved[:1]))
         pulls = []
         for slot, (edge, (along, parts_along, g, h, gamma)) in enumerate(
-            zip(network.edges(moved[0]), self.springs, strict=True)
+            zip(topology.edges(moved[0]), self.springs, strict=True)
         ):
             pull = h * product(parts_along, parts[0][slot])
             if damped:
                 pull = pull + gamma * product(parts_along, parts[1][slot])
             pull = lax.optimization_barrier(pull)
-            pulls.append(network.ways.scaled(g, edge) + network.ways.scaled(pull, along))
-        return self.force + network.resultant(pulls)
+            pulls.append(topology.neighbours.scale_edges(g, edge) + topology.neighbours.scale_edges(pull, along))
+        return self.force + topology.resultant(pulls)
 
 
 def product(a: list[Array], b: list[Array]) -> Any:
@@ -55,7 +55,7 @@ def product(a: list[Array], b: list[Array]) -> Any:
     return total
 
 
-def tangent_numbers(k: Array, ratio: Array, square: Array) -> tuple[Array, Array]:
+def spring_jacobian_coefficients(k: Array, ratio: Array, square: Array) -> tuple[Array, Array]:
     """g and h of a spring of stiffness k [N/m], from L/l and l²."""
     g = k * jnp.maximum(1 - ratio, 0.0)
     return g, (k - g) / square

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.physics.springs.assembly import Lattice, build_lattice, vector_lengths
 from physjax.physics.springs.mesh_sheets import from_mesh
 
@@ -37,14 +37,14 @@ def rope(
         >>> print(rope.state.position[:, 0], len(rope.springs.pairs))
         [0. 1. 2. 3. 4.] 4
     """
-    nodes = positive_integer("nodes", nodes, at_least=2)
-    ends = [np.asarray(real_quantity(name, value)) for name, value in (("start [m]", start), ("end [m]", end))]
+    nodes = as_positive_integer("nodes", nodes, at_least=2)
+    ends = [np.asarray(as_real_quantity(name, value)) for name, value in (("start [m]", start), ("end [m]", end))]
     if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
         raise ValueError(f"rope: got start {ends[0].shape} and end {ends[1].shape}, expected two points (2,) or (3,).")
     x = np.linspace(*ends, nodes)
     way = vector_lengths(ends[1] - ends[0])
-    stretch = 1.0 if length is None else real_quantity("length [m]", length, above=0) / way
-    kinds = [(_tie((nodes,), [(1,)]), stiffness), (_tie((nodes,), [(2,)]), bend)]
+    stretch = 1.0 if length is None else as_real_quantity("length [m]", length, above=0) / way
+    kinds = [(_pair_nodes((nodes,), [(1,)]), stiffness), (_pair_nodes((nodes,), [(2,)]), bend)]
     share = np.ones(nodes)
     share[[0, -1]] = 0.5
     index = np.arange(nodes)
@@ -80,10 +80,10 @@ def cloth(
         >>> len(sail.state.position), len(sail.springs.pairs)
         (6, 11)
     """
-    rows, columns = positive_integer("rows", rows, at_least=2), positive_integer("columns", columns, at_least=2)
-    lengths = [float(real_quantity(f"{n} [m]", v, above=0)) for n, v in (("width", width), ("height", height))]
+    rows, columns = as_positive_integer("rows", rows, at_least=2), as_positive_integer("columns", columns, at_least=2)
+    lengths = [float(as_real_quantity(f"{n} [m]", v, above=0)) for n, v in (("width", width), ("height", height))]
     across, down, corner = (
-        np.asarray(real_quantity(n, v)) for n, v in (("across", across), ("down", down), ("corner", corner))
+        np.asarray(as_real_quantity(n, v)) for n, v in (("across", across), ("down", down), ("corner", corner))
     )
     if {across.shape, down.shape, corner.shape} != {(3,)}:
         raise ValueError(
@@ -97,16 +97,24 @@ def cloth(
     x = x + np.multiply.outer(i * lengths[1] / (rows - 1), below)
     shape = (rows, columns)
     kinds = [
-        (_tie(shape, [(0, 1), (1, 0)]), structural),
-        (_tie(shape, [(1, 1), (1, -1)]), shear),
-        (_tie(shape, [(0, 2), (2, 0)]), bend),
+        (_pair_nodes(shape, [(0, 1), (1, 0)]), structural),
+        (_pair_nodes(shape, [(1, 1), (1, -1)]), shear),
+        (_pair_nodes(shape, [(0, 2), (2, 0)]), bend),
     ]
     sets = {"top": i == 0, "bottom": i == rows - 1, "left": j == 0, "right": j == columns - 1}
     sets |= {f"{a}_{b}": sets[a] & sets[b] for a in ("top", "bottom") for b in ("left", "right")}
     sets["edge"] = sets["top"] | sets["bottom"] | sets["left"] | sets["right"]
     sets["corners"] = (sets["top"] | sets["bottom"]) & (sets["left"] | sets["right"])
     return build_lattice(
-        x, kinds, damping, breaks_at, mass, _shares(shape), sets, _cells(np.arange(i.size).reshape(shape)), shape
+        x,
+        kinds,
+        damping,
+        breaks_at,
+        mass,
+        _compute_node_shares(shape),
+        sets,
+        _triangulate_cells(np.arange(i.size).reshape(shape)),
+        shape,
     )
 
 
@@ -132,10 +140,10 @@ def jelly(
         >>> len(cube.state.position), len(cube.springs.pairs)
         (8, 12)
     """
-    shape = tuple(positive_integer("nodes", n, at_least=2) for n in nodes)
+    shape = tuple(as_positive_integer("nodes", n, at_least=2) for n in nodes)
     lengths, corner = (
-        np.asarray(real_quantity("size [m]", size, above=0)),
-        np.asarray(real_quantity("corner [m]", corner)),
+        np.asarray(as_real_quantity("size [m]", size, above=0)),
+        np.asarray(as_real_quantity("corner [m]", corner)),
     )
     if (len(shape), lengths.shape, corner.shape) != (3, (3,), (3,)):
         raise ValueError(f"jelly: got {len(shape)} counts of nodes and size {lengths.shape}, expected three of each.")
@@ -144,9 +152,9 @@ def jelly(
     steps = [s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 0)]
     straight = [s for s in steps if sum(map(abs, s)) == 1]
     kinds = [
-        (_tie(shape, straight), structural),
-        (_tie(shape, [s for s in steps if s not in straight]), shear),
-        (_tie(shape, [tuple(2 * a for a in s) for s in straight]), bend),
+        (_pair_nodes(shape, straight), structural),
+        (_pair_nodes(shape, [s for s in steps if s not in straight]), shear),
+        (_pair_nodes(shape, [tuple(2 * a for a in s) for s in straight]), bend),
     ]
     last = place == np.array(shape) - 1
     sides = [(place == 0)[:, a] if end == 0 else last[:, a] for a in range(3) for end in (0, 1)]
@@ -157,8 +165,10 @@ def jelly(
     skin = []
     for axis in range(3):  # outward on both sides
         low, high = np.take(number, 0, axis), np.take(number, -1, axis)
-        skin += [_cells(low if axis == 1 else low.T), _cells(high.T if axis == 1 else high)]
-    return build_lattice(x, kinds, damping, breaks_at, mass, _shares(shape), sets, np.concatenate(skin), shape)
+        skin += [_triangulate_cells(low if axis == 1 else low.T), _triangulate_cells(high.T if axis == 1 else high)]
+    return build_lattice(
+        x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, np.concatenate(skin), shape
+    )
 
 
 def bridge(
@@ -183,15 +193,15 @@ def bridge(
         >>> len(truss.state.position), len(truss.springs.pairs), int(truss.nodes["supports"].sum())
         (10, 21, 2)
     """
-    panels = positive_integer("panels", panels, at_least=1)
+    panels = as_positive_integer("panels", panels, at_least=1)
     sides = [span, height] if width is None else [span, height, width]
-    lengths = np.array([float(real_quantity("span, height and width [m]", side, above=0)) for side in sides])
+    lengths = np.array([float(as_real_quantity("span, height and width [m]", side, above=0)) for side in sides])
     shape = (panels + 1, *[2] * (len(sides) - 1))
     place = np.indices(shape).reshape(len(shape), -1).T
     x = place * (lengths / (np.array(shape) - 1))
     steps = [s for s in product((-1, 0, 1), repeat=len(shape)) if s > (0,) * len(shape)]
     flat = [s for s in steps if sum(map(abs, s)) <= 2]  # along the edges and across the faces of each box
-    pairs = _tie(shape, flat)
+    pairs = _pair_nodes(shape, flat)
     along = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]])
     share = np.bincount(pairs.ravel(), np.repeat(along, 2), len(x))
     sets = {"left": place[:, 0] == 0, "right": place[:, 0] == panels, "deck": place[:, 1] == 0, "top": place[:, 1] == 1}
@@ -199,7 +209,7 @@ def bridge(
     return build_lattice(x, [(pairs, stiffness)], damping, breaks_at, mass, share, sets, np.zeros((0, 3), int), shape)
 
 
-def _tie(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.ndarray:
+def _pair_nodes(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.ndarray:
     """Pairs of all nodes of a lattice that are the given steps apart."""
     number, pairs = np.arange(np.prod(shape)).reshape(shape), []
     for step in steps:
@@ -210,7 +220,7 @@ def _tie(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.ndarray
     return np.concatenate(pairs) if pairs else np.zeros((0, 2), int)
 
 
-def _shares(shape: tuple[int, ...]) -> np.ndarray:
+def _compute_node_shares(shape: tuple[int, ...]) -> np.ndarray:
     """Each node's share of a lattice: half as much at the end of a row, in every direction."""
     share = np.ones(1)
     for count in shape:
@@ -220,7 +230,7 @@ def _shares(shape: tuple[int, ...]) -> np.ndarray:
     return share
 
 
-def _cells(number: np.ndarray) -> np.ndarray:
+def _triangulate_cells(number: np.ndarray) -> np.ndarray:
     """Two triangles for each cell of a sheet of nodes."""
     a, b, c, d = (number[i : i - 1 or None, j : j - 1 or None].ravel() for i in (0, 1) for j in (0, 1))
     return np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])

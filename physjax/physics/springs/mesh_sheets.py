@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.checks import real_quantity
-from physjax.meshes import checked_mesh, near_pieces, read_mesh
+from physjax.checks import as_real_quantity
+from physjax.meshes import check_mesh, find_near_pieces, read_mesh
 from physjax.meshes import weld as join_vertices
 from physjax.physics.springs.assembly import Lattice, build_lattice, vector_lengths
 
@@ -46,9 +46,9 @@ def from_mesh(
             raise TypeError("from_mesh: got a file and faces, expected a file alone, or vertices and faces.")
         x, faces = read_mesh(mesh, triangulate=triangulate)
     else:
-        x, faces = checked_mesh(mesh, faces)
-    x, faces = _welded(x, faces, weld)
-    edges, opposite, lonely = _edges(faces)
+        x, faces = check_mesh(mesh, faces)
+    x, faces = _weld_mesh(x, faces, weld)
+    edges, opposite, lonely = _find_edges(faces)
     a, b, c = (x[faces[:, i]] for i in range(3))
     area = vector_lengths(np.cross(b - a, c - a)) / 2
     share = np.bincount(faces.ravel(), np.repeat(area, 3), len(x))
@@ -61,10 +61,10 @@ def from_mesh(
     return build_lattice(x, [(edges, structural), (opposite, bend)], damping, breaks_at, mass, share, sets, faces, None)
 
 
-def _welded(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
+def _weld_mesh(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with one node for each place; says what was joined, and refuses what falls apart into single triangles."""
     if tolerance is not None:
-        tolerance = float(real_quantity("weld [m]", tolerance, at_least=0))
+        tolerance = float(as_real_quantity("weld [m]", tolerance, at_least=0))
         if tolerance == 0:
             return x, faces
     found = join_vertices(x, faces, tolerance)
@@ -84,7 +84,7 @@ def _welded(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[
             f"from_mesh: none of the {len(found.faces)} triangles shares a vertex with another, so that the sheet would fall "
             "apart. Give weld=, a distance [m] within which vertices are one; weld=0 if they are to be single triangles."
         )
-    pieces, apart = near_pieces(found.vertices, found.faces) if tolerance is None else (0, 0.0)
+    pieces, apart = find_near_pieces(found.vertices, found.faces) if tolerance is None else (0, 0.0)
     if pieces:
         warnings.warn(
             f"from_mesh: {pieces} pieces of the mesh share no vertex though they come within {apart:.3g} m of each other, and no "
@@ -94,7 +94,7 @@ def _welded(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[
     return found.vertices, found.faces
 
 
-def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _find_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Edges of triangles, pairs of vertices opposite an inner edge (no edges themselves), and vertices on the boundary."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     corner = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])

@@ -8,11 +8,11 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import declared, positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity, unchecked_quantity
 from physjax.particles import Particles
 from physjax.parts import Force
-from physjax.physics.springs.jacobian import SpringsTangent, product, tangent_numbers
-from physjax.physics.springs.topology import Network
+from physjax.physics.springs.jacobian import LinearisedSprings, product, spring_jacobian_coefficients
+from physjax.physics.springs.topology import SpringTopology
 from physjax.vectors import dot, norm, square_root, unit
 
 
@@ -34,13 +34,13 @@ class Springs(Force):
     """
 
     couples: ClassVar[bool] = True
-    definite: ClassVar[bool] = True
-    network: Network = eqx.field(static=True)
-    k: Float[Array, "..."] = declared("stiffness", "N/m", per="spring", at_least=0)
-    L: Float[Array, "..."] = declared("rest length", "m", per="spring", at_least=0)
-    c: Float[Array, "..."] | None = declared("damping", "kg/s", per="spring", at_least=0)
-    limit: Float[Array, "..."] | None = declared("breaks_at", per="spring", at_least=0)
-    intact: Bool[Array, "..."] | None = declared("unbroken", per="spring")
+    dissipative_symmetric: ClassVar[bool] = True
+    topology: SpringTopology = eqx.field(static=True)
+    k: Float[Array, "..."] = unchecked_quantity("stiffness", "N/m", per="spring", at_least=0)
+    L: Float[Array, "..."] = unchecked_quantity("rest length", "m", per="spring", at_least=0)
+    c: Float[Array, "..."] | None = unchecked_quantity("damping", "kg/s", per="spring", at_least=0)
+    limit: Float[Array, "..."] | None = unchecked_quantity("breaks_at", per="spring", at_least=0)
+    intact: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="spring")
 
     def __init__(
         self,
@@ -53,114 +53,118 @@ class Springs(Force):
         nodes: int | None = None,
         layout: str | None = None,
     ):
-        self.network = Network(pairs, None if nodes is None else positive_integer("nodes", nodes), layout)
-        self.k = self._spread("stiffness [N/m]", stiffness)
-        self.L = self._spread("rest length [m]", rest_length)
-        self.c = None if damping is None else self._spread("damping [kg/s]", damping)
-        self.limit = None if breaks_at is None else self._spread("breaks_at [1]", breaks_at)
+        self.topology = SpringTopology(pairs, None if nodes is None else as_positive_integer("nodes", nodes), layout)
+        self.k = self._lay_out("stiffness [N/m]", stiffness)
+        self.L = self._lay_out("rest length [m]", rest_length)
+        self.c = None if damping is None else self._lay_out("damping [kg/s]", damping)
+        self.limit = None if breaks_at is None else self._lay_out("breaks_at [1]", breaks_at)
         self.intact = None
         if breaks_at is not None:
             scenes = jnp.broadcast_shapes(*(a.shape[:-2] for a in (self.k, self.L, self.limit)))
-            self.intact = jnp.broadcast_to(self.network.present, (*scenes, *self.network.present.shape))
+            self.intact = jnp.broadcast_to(self.topology.present, (*scenes, *self.topology.present.shape))
 
     @property
     def pairs(self) -> Any:
         """The two nodes of each spring, `(springs, 2)`."""
-        return self.network.pairs
+        return self.topology.pairs
 
     @property
     def nodes(self) -> int:
         """The number of nodes."""
-        return self.network.nodes
+        return self.topology.nodes
 
     @property
     def layout(self) -> str:
         """How neighbours are found: "bands" or "gather"."""
-        return self.network.layout
+        return self.topology.layout
 
     @property
     def stiffness(self) -> Float[Array, "..."]:
         """k [N/m], as given: for all springs or one each. Of a gradient: the derivative by it."""
-        return self.network.collect(self.k)
+        return self.topology.collect(self.k)
 
     @property
     def rest_length(self) -> Float[Array, "..."]:
         """L [m], as given."""
-        return self.network.collect(self.L)
+        return self.topology.collect(self.L)
 
     @property
     def damping(self) -> Float[Array, "..."] | None:
         """c [kg/s], as given."""
-        return None if self.c is None else self.network.collect(self.c)
+        return None if self.c is None else self.topology.collect(self.c)
 
     @property
     def breaks_at(self) -> Float[Array, "..."] | None:
         """The strain beyond which a spring parts, as given."""
-        return None if self.limit is None else self.network.collect(self.limit)
+        return None if self.limit is None else self.topology.collect(self.limit)
 
     @property
     def unbroken(self) -> Bool[Array, "*scenes springs"] | None:
         """Which springs still hold; None for springs that cannot break."""
-        return None if self.intact is None else self.network.collect(self.intact)
+        return None if self.intact is None else self.topology.collect(self.intact)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes dim"]:
         """Σ (k (1 - L/l) + c (d·ḋ)/l²) d over the springs of each node, d to the other end [N]."""
         self._demand_nodes(state)
-        network, damped = self.network, self.c is not None
-        parts = network.parts(*(state if damped else state[:1]))
+        topology, damped = self.topology, self.c is not None
+        parts = topology.parts(*(state if damped else state[:1]))
         pulls = []
-        for slot, (edge, d) in enumerate(zip(network.edges(state.position), parts[0], strict=True)):
-            k, L = self._at(slot, self.k, d), self._at(slot, self.L, d)
+        for slot, (edge, d) in enumerate(zip(topology.edges(state.position), parts[0], strict=True)):
+            k, L = self._take_slot(slot, self.k, d), self._take_slot(slot, self.L, d)
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
             pull = k * (apart - L * square_root(square))
             if damped:
-                pull = pull + self._at(slot, self.c, d) * product(d, parts[1][slot])
+                pull = pull + self._take_slot(slot, self.c, d) * product(d, parts[1][slot])
             # kept apart, or it would be computed anew for every component and both ends; a division at the end is what
             # older compilers keep apart by themselves
-            weight = lax.optimization_barrier(jnp.where(self._at(slot, self._holding, d), pull, 0.0) / apart)
-            pulls.append(network.ways.scaled(weight, edge))
-        return network.resultant(pulls)
+            weight = lax.optimization_barrier(
+                jnp.where(self._take_slot(slot, self._unbroken_slots, d), pull, 0.0) / apart
+            )
+            pulls.append(topology.neighbours.scale_edges(weight, edge))
+        return topology.resultant(pulls)
 
-    def near(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> SpringsTangent:
+    def linearised_at(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> LinearisedSprings:
         """The springs near a state, with a derivative that always pushes back: what an implicit step sees of them."""
         springs = []
         x = state.position
-        for slot, (edge, d) in enumerate(zip(self.network.edges(x), self.network.parts(x)[0], strict=True)):
+        for slot, (edge, d) in enumerate(zip(self.topology.edges(x), self.topology.parts(x)[0], strict=True)):
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
-            holding = self._at(slot, self._holding, d)
-            k = jnp.where(holding, self._at(slot, self.k, d), 0.0)
-            g, h = tangent_numbers(k, self._at(slot, self.L, d) * square_root(square) / apart, apart)
-            gamma = None if self.c is None else jnp.where(holding, self._at(slot, self.c, d), 0.0) / apart
+            holding = self._take_slot(slot, self._unbroken_slots, d)
+            k = jnp.where(holding, self._take_slot(slot, self.k, d), 0.0)
+            g, h = spring_jacobian_coefficients(
+                k, self._take_slot(slot, self.L, d) * square_root(square) / apart, apart
+            )
+            gamma = None if self.c is None else jnp.where(holding, self._take_slot(slot, self.c, d), 0.0) / apart
             springs.append((edge, d, g, h, gamma))
-        return SpringsTangent(self.network, state, self(t, state, mass), springs)
+        return LinearisedSprings(self.topology, state, self(t, state, mass), springs)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
         """½k(l - L)² [J], halved between the two ends."""
         self._demand_nodes(state)
         energies = []
-        for slot, d in enumerate(self.network.parts(state.position)[0]):
-            stretch = square_root(product(d, d)) - self._at(slot, self.L, d)
-            energy = 0.25 * self._at(slot, self.k, d) * stretch * stretch
-            energies.append(jnp.where(self._at(slot, self._holding, d), energy, 0.0))
-        return self.network.ways.shared(energies)
+        for slot, d in enumerate(self.topology.parts(state.position)[0]):
+            stretch = square_root(product(d, d)) - self._take_slot(slot, self.L, d)
+            energy = 0.25 * self._take_slot(slot, self.k, d) * stretch * stretch
+            energies.append(jnp.where(self._take_slot(slot, self._unbroken_slots, d), energy, 0.0))
+        return self.topology.neighbours.sum_at_both_ends(energies)
 
     @property
     def advance(self) -> Any:
         """`advance(t, dt, state) -> (springs, state)` parts the springs that are overstretched; only if they can break."""
         if self.limit is None:
             raise AttributeError("springs without breaks_at remember nothing")
-        return self._part
+        return self._break_overstretched
 
-    def _part(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
+    def _break_overstretched(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
         self._demand_nodes(state)
         held = []
-        for slot, d in enumerate(self.network.parts(state.position)[0]):
-            L, limit = self._at(slot, self.L, d), self._at(slot, self.limit, d)
+        for slot, d in enumerate(self.topology.parts(state.position)[0]):
+            L, limit = self._take_slot(slot, self.L, d), self._take_slot(slot, self.limit, d)
             square = product(d, d)
-            held.append(self._at(slot, self.intact, d) & (square <= (L * (1 + limit)) ** 2))
-        intact = self.network.ways.owned(held)
+            held.append(self._take_slot(slot, self.intact, d) & (square <= (L * (1 + limit)) ** 2))
+        intact = self.topology.neighbours.stack_slots(held)
         if intact.shape != self.intact.shape:
             raise ValueError(
                 f"Springs: got positions of shape {state.position.shape} and breaks_at for the scenes "
@@ -170,62 +174,62 @@ class Springs(Force):
 
     def length(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """Length l of each spring [m]."""
-        return norm(self._line(state.position))
+        return norm(self._edge_vectors(state.position))
 
     def strain(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """(l - L)/L of each spring; infinite for a spring without rest length."""
         length = self.length(state)
-        return (length - self._each(self.rest_length, length)) / self._each(self.rest_length, length)
+        return (length - self._align_axes(self.rest_length, length)) / self._align_axes(self.rest_length, length)
 
     def tension(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """k (l - L) + c l̇ of each spring [N]: positive when it pulls, zero when it is broken."""
         length = self.length(state)
-        tension = self._each(self.stiffness, length) * (length - self._each(self.rest_length, length))
+        tension = self._align_axes(self.stiffness, length) * (length - self._align_axes(self.rest_length, length))
         if self.c is not None:
-            rate = dot(unit(self._line(state.position)), self._line(state.velocity))
-            tension = tension + self._each(self.damping, length) * rate
-        return self._if_unbroken(tension)
+            rate = dot(unit(self._edge_vectors(state.position)), self._edge_vectors(state.velocity))
+            tension = tension + self._align_axes(self.damping, length) * rate
+        return self._zero_broken(tension)
 
     def energy(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """½k(l - L)² of each spring [J], zero when it is broken."""
         length = self.length(state)
-        stretch = length - self._each(self.rest_length, length)
-        return self._if_unbroken(0.5 * self._each(self.stiffness, length) * stretch * stretch)
+        stretch = length - self._align_axes(self.rest_length, length)
+        return self._zero_broken(0.5 * self._align_axes(self.stiffness, length) * stretch * stretch)
 
     @property
-    def _holding(self) -> Any:
+    def _unbroken_slots(self) -> Any:
         """The slots in which a spring holds."""
-        return self.network.present if self.intact is None else self.intact
+        return self.topology.present if self.intact is None else self.intact
 
-    def _at(self, slot: int, number: Any, like: list[Array]) -> Any:
+    def _take_slot(self, slot: int, number: Any, like: list[Array]) -> Any:
         """A number of the springs in a slot, `()` or with the axes of the scenes and of the slot."""
         if number.ndim == 0:
             return number
-        each = number.shape[-2:] == self.network.present.shape
-        number = self.network.ways.at(number, slot) if each else number[..., 0, :]
+        each = number.shape[-2:] == self.topology.present.shape
+        number = self.topology.neighbours.at(number, slot) if each else number[..., 0, :]
         return number.reshape((1,) * (like[0].ndim - number.ndim) + number.shape)
 
-    def _each(self, number: Array, like: Array) -> Array:
+    def _align_axes(self, number: Array, like: Array) -> Array:
         """A number as given, with the axes of the scenes and springs."""
         return number.reshape((1,) * (like.ndim - number.ndim) + number.shape) if number.ndim else number
 
-    def _if_unbroken(self, number: Array) -> Array:
-        return number if self.intact is None else number * self._each(self.unbroken, number).astype(number.dtype)
+    def _zero_broken(self, number: Array) -> Array:
+        return number if self.intact is None else number * self._align_axes(self.unbroken, number).astype(number.dtype)
 
-    def _line(self, a: Array) -> Array:
-        first, second = self.network.ends(a)
+    def _edge_vectors(self, a: Array) -> Array:
+        first, second = self.topology.ends(a)
         return second - first
 
-    def _spread(self, name: str, value: Any) -> Array:
+    def _lay_out(self, name: str, value: Any) -> Array:
         """A checked number of the springs, laid out."""
-        number = real_quantity(name, value, at_least=0)
-        springs = len(self.network.pairs)
+        number = as_real_quantity(name, value, at_least=0)
+        springs = len(self.topology.pairs)
         if number.ndim and number.shape[-1] != springs and (number.ndim == 1 or number.shape[-1] != 1):
             raise ValueError(
                 f"{name}: got shape {number.shape}, expected () for all springs or ({springs},), one each; swept over "
                 f"scenes, (*scenes, {springs}) or (*scenes, 1)."
             )
-        return self.network.spread(number)
+        return self.topology.spread(number)
 
     def _demand_nodes(self, state: Particles) -> None:
         if state.lanes[-1:] != (self.nodes,):

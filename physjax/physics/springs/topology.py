@@ -14,12 +14,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from physjax.physics.springs.custom_transpose import linear
+from physjax.physics.springs.custom_transpose import apply_linear
 
 LAYOUTS = ("bands", "gather")
-EMPTIEST = 8
+MAX_SLOTS_PER_SPRING = 8
 """Slots for each spring up to which bands pay: a slot of a band costs an eighth of a gathered spring."""
-MOST_BANDS = 48
+MAX_BANDS = 48
 """Bands are written out one by one; more than this would compile for seconds."""
 
 
@@ -34,18 +34,22 @@ class Bands(NamedTuple):
 
     def edges(self, *arrays: Array) -> list[Array]:
         """Differences between both ends, slot by slot, for each array in turn; where there is no spring, without meaning."""
-        return [_ahead(self._near(wide, d), d) for wide in map(self._wide, arrays) for d in self.offsets]
+        return [
+            _forward_difference(self._slice_reachable(wide, d), d)
+            for wide in map(self._pad_columns, arrays)
+            for d in self.offsets
+        ]
 
     def parts(self, *arrays: Array) -> list[Array]:
         """The differences again, component by component; not slices of `edges`, or a program would keep those in memory."""
         return [
-            _ahead(self._near(wide[..., i, :], d), d)
-            for wide in map(self._wide, arrays)
+            _forward_difference(self._slice_reachable(wide[..., i, :], d), d)
+            for wide in map(self._pad_columns, arrays)
             for d in self.offsets
             for i in range(wide.shape[-2])
         ]
 
-    def ends_of_parts(self, dim: int, *parts: Array) -> list[Array]:
+    def transpose_parts(self, dim: int, *parts: Array) -> list[Array]:
         """The transpose of `parts`, which are kept apart: each is used at both ends."""
         parts = lax.optimization_barrier(parts)
         count, found = len(self.offsets) * dim, []
@@ -66,12 +70,12 @@ class Bands(NamedTuple):
             found.append(jnp.swapaxes(lax.optimization_barrier(total), -1, -2))
         return found
 
-    def _wide(self, a):
+    def _pad_columns(self, a):
         """Components first and nodes last, with room for the furthest neighbour on both sides; kept apart from what uses it."""
         far, columns = max(self.offsets), jnp.swapaxes(a, -1, -2)
         return lax.optimization_barrier(jnp.pad(columns, [(0, 0)] * (a.ndim - 1) + [(far, far)]))
 
-    def _near(self, wide, d):
+    def _slice_reachable(self, wide, d):
         """All nodes, and as many before and behind them as an offset reaches."""
         far = max(self.offsets)
         return wide[..., far - d : wide.shape[-1] - far + d]
@@ -81,16 +85,16 @@ class Bands(NamedTuple):
         pad = np.pad if isinstance(number, np.ndarray) else jnp.pad
         return pad(number[..., slot, :], [(0, 0)] * (number.ndim - 2) + [(self.offsets[slot], 0)])
 
-    def scaled(self, number: Array, edge: Array) -> Array:
+    def scale_edges(self, number: Array, edge: Array) -> Array:
         """A number of each spring times a difference."""
         return number[..., None, :] * edge
 
-    def shared(self, numbers: list[Array]) -> Array:
+    def sum_at_both_ends(self, numbers: list[Array]) -> Array:
         """Σ of a number of each spring over both of its ends, `(*scenes, nodes)`."""
         pairs = zip(numbers, self.offsets, strict=True)
         return sum(number[..., d:] + number[..., : number.shape[-1] - d] for number, d in pairs)
 
-    def owned(self, numbers: list[Array]) -> Array:
+    def stack_slots(self, numbers: list[Array]) -> Array:
         """A number of each spring in its slots, `(*scenes, slots, nodes)`."""
         return jnp.stack([n[..., d:] for n, d in zip(numbers, self.offsets, strict=True)], axis=-2)
 
@@ -128,37 +132,37 @@ class Table(NamedTuple):
         """The part of a number in slots that belongs to one of them."""
         return number[..., slot, :]
 
-    def scaled(self, number: Array, edge: Array) -> Array:
+    def scale_edges(self, number: Array, edge: Array) -> Array:
         """A number of each spring times a difference."""
         return number[..., None] * edge
 
-    def shared(self, numbers: list[Array]) -> Array:
+    def sum_at_both_ends(self, numbers: list[Array]) -> Array:
         """Σ of a number of each spring over both of its ends, `(*scenes, nodes)`."""
         flat = jnp.concatenate([*numbers, jnp.zeros_like(numbers[0][..., :1])], axis=-1)
         return sum(numbers) + jnp.sum(take(flat[..., None], self.arrivals)[..., 0], axis=-2)
 
-    def owned(self, numbers: list[Array]) -> Array:
+    def stack_slots(self, numbers: list[Array]) -> Array:
         """A number of each spring in its slots, `(*scenes, slots, nodes)`."""
         return jnp.stack(numbers, axis=-2)
 
 
-class Network:
+class SpringTopology:
     """Pairs of nodes in a layout: compared by content, so that it can be part of what a program is compiled for."""
 
     def __init__(self, pairs: Any, nodes: int | None, layout: str | None):
-        self.pairs, self.nodes = checked_pairs(pairs, nodes)
+        self.pairs, self.nodes = check_pairs(pairs, nodes)
         if layout not in (None, *LAYOUTS):
             raise ValueError(f"layout: got {layout!r}, expected one of {', '.join(LAYOUTS)}, or None for the faster.")
         low, high = self.pairs.min(axis=1), self.pairs.max(axis=1)
-        slot, offsets = _bands(low, high)
-        fits = len(offsets) <= MOST_BANDS and len(offsets) * self.nodes <= EMPTIEST * len(low)
+        slot, offsets = _find_bands(low, high)
+        fits = len(offsets) <= MAX_BANDS and len(offsets) * self.nodes <= MAX_SLOTS_PER_SPRING * len(low)
         self.layout = layout or ("bands" if fits else "gather")
         if self.layout == "bands":
-            owner, self.ways = low, Bands(offsets)
+            owner, self.neighbours = low, Bands(offsets)
         else:
-            owner, other = _balanced(self.pairs, self.nodes)
-            slot = rank(owner, self.nodes)
-            self.ways = _table(owner, other, slot, self.nodes)
+            owner, other = _balance_owners(self.pairs, self.nodes)
+            slot = rank_in_group(owner, self.nodes)
+            self.neighbours = _build_table(owner, other, slot, self.nodes)
         self.slots = int(slot.max()) + 1
         self.places = slot * self.nodes + owner
         self.present = np.zeros((self.slots, self.nodes), bool)
@@ -167,7 +171,7 @@ class Network:
 
     def __eq__(self, other: Any) -> bool:
         return self is other or (
-            isinstance(other, Network)
+            isinstance(other, SpringTopology)
             and self._hash == other._hash
             and (self.nodes, self.layout) == (other.nodes, other.layout)
             and np.array_equal(self.pairs, other.pairs)
@@ -198,28 +202,30 @@ class Network:
 
     def edges(self, x: Float[Array, "*scenes nodes dim"]) -> list[Array]:
         """Differences along the springs, slot by slot, as the layout has them."""
-        return linear(self.ways.edges, self.ways.ends, (x,))
+        return apply_linear(self.neighbours.edges, self.neighbours.ends, (x,))
 
     def parts(self, *arrays: Float[Array, "*scenes nodes dim"]) -> list[list[list[Array]]]:
         """Differences along the springs of each array, slot by slot, component by component."""
         dim = arrays[0].shape[-1]
-        if isinstance(self.ways, Bands):
-            found = linear(self.ways.parts, partial(self.ways.ends_of_parts, dim), arrays)
+        if isinstance(self.neighbours, Bands):
+            found = apply_linear(self.neighbours.parts, partial(self.neighbours.transpose_parts, dim), arrays)
         else:
-            found = [e[..., i] for e in linear(self.ways.edges, self.ways.ends, arrays) for i in range(dim)]
+            found = [
+                e[..., i] for e in apply_linear(self.neighbours.edges, self.neighbours.ends, arrays) for i in range(dim)
+            ]
         slots = [found[i : i + dim] for i in range(0, len(found), dim)]
         return [slots[i : i + self.slots] for i in range(0, len(slots), self.slots)]
 
     def resultant(self, pulls: list[Array]) -> Float[Array, "*scenes nodes dim"]:
         """What pulls each node: the sum over the springs that it owns minus that over the springs that arrive."""
-        return -linear(self.ways.ends, self.ways.edges, tuple(pulls))[0]
+        return -apply_linear(self.neighbours.ends, self.neighbours.edges, tuple(pulls))[0]
 
     def ends(self, a: Float[Array, "*scenes nodes dim"]) -> tuple[Array, Array]:
         """What the first and the second node of each pair have, `(*scenes, springs, dim)`."""
         return a[..., self.pairs[:, 0], :], a[..., self.pairs[:, 1], :]
 
 
-def checked_pairs(pairs: Any, nodes: int | None) -> tuple[np.ndarray, int]:
+def check_pairs(pairs: Any, nodes: int | None) -> tuple[np.ndarray, int]:
     """Pairs of different nodes as int32, and the number of nodes: the largest index and one, unless given."""
     pairs = np.asarray(pairs)
     if pairs.size == 0:
@@ -245,7 +251,7 @@ def checked_pairs(pairs: Any, nodes: int | None) -> tuple[np.ndarray, int]:
     return pairs.astype(np.int32), nodes
 
 
-def _ahead(columns: Array, offset: int) -> Array:
+def _forward_difference(columns: Array, offset: int) -> Array:
     """The differences between each entry of the last axis and the one that is further on, `offset` fewer."""
     return columns[..., offset:] - columns[..., : columns.shape[-1] - offset]
 
@@ -260,24 +266,24 @@ def take(rows: Array, index: np.ndarray) -> Array:
     return lax.gather(rows, index[..., None], dims, sizes, mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
-def rank(keys: np.ndarray, count: int) -> np.ndarray:
+def rank_in_group(keys: np.ndarray, count: int) -> np.ndarray:
     """How many earlier entries have the same key."""
     order = np.argsort(keys, kind="stable")
     sizes = np.bincount(keys, minlength=count)
-    rank = np.empty(len(keys), np.int64)
-    rank[order] = np.arange(len(keys)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return rank
+    rank_in_group = np.empty(len(keys), np.int64)
+    rank_in_group[order] = np.arange(len(keys)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return rank_in_group
 
 
-def _bands(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
+def _find_bands(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, tuple[int, ...]]:
     """The band of each spring, and the offset of each band; springs between the same two nodes get a band each."""
     _, same = np.unique(low.astype(np.int64) * (high.max() + 1) + high, return_inverse=True)
-    side = rank(same.ravel(), int(same.max()) + 1)
+    side = rank_in_group(same.ravel(), int(same.max()) + 1)
     kinds, slot = np.unique((high - low).astype(np.int64) * (side.max() + 1) + side, return_inverse=True)
     return slot.ravel(), tuple(int(kind) for kind in kinds // (side.max() + 1))
 
 
-def _balanced(pairs: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+def _balance_owners(pairs: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """An owner and another end for each spring, so that a node owns as many as arrive, give or take one.
 
     Every spring is walked along once, from its owner to the other end, in walks that only end where nothing is left
@@ -304,9 +310,9 @@ def _balanced(pairs: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     return owner, other
 
 
-def _table(owner: np.ndarray, other: np.ndarray, slot: np.ndarray, nodes: int) -> Table:
+def _build_table(owner: np.ndarray, other: np.ndarray, slot: np.ndarray, nodes: int) -> Table:
     """The tables of neighbours and of arriving springs."""
-    slots, arriving = int(slot.max()) + 1, rank(other, nodes)
+    slots, arriving = int(slot.max()) + 1, rank_in_group(other, nodes)
     ends = np.tile(np.arange(nodes, dtype=np.int32), (slots, 1))
     ends[slot, owner] = other
     arrivals = np.full((int(arriving.max()) + 1, nodes), slots * nodes, np.int32)

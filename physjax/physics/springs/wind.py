@@ -9,12 +9,12 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import kept_apart
+from physjax.backend import materialise
 from physjax.checks import quantity
 from physjax.particles import Particles
 from physjax.parts import Force
-from physjax.physics.springs.topology import rank, take
-from physjax.vectors import cross, dot, norm, over, scale, unit
+from physjax.physics.springs.topology import rank_in_group, take
+from physjax.vectors import broadcast_vector, cross, dot, norm, scale, unit
 
 
 class Cells:
@@ -40,21 +40,21 @@ class Cells:
 
     def faces(self, x: Array, v: Array) -> tuple[Array, Array]:
         """Area vector [m²] and velocity [m/s] of each cell."""
-        a, b, c, d = self._corners(x)
-        p, q, r, s = self._corners(v)
+        a, b, c, d = self._take_corners(x)
+        p, q, r, s = self._take_corners(v)
         return 0.5 * cross(d - a, b - c), 0.25 * (p + q + r + s)
 
-    def gathered(self, newtons: Array) -> Array:
+    def sum_at_nodes(self, newtons: Array) -> Array:
         """The cells' forces shared among their corners, `(*scenes, nodes, 3)`."""
-        total = 0.25 * sum(self._shifted(newtons, self.rows, self.columns))
+        total = 0.25 * sum(self._slice_shifted(newtons, self.rows, self.columns))
         return total.reshape((*newtons.shape[:-3], self.nodes, newtons.shape[-1]))
 
-    def _corners(self, a):
+    def _take_corners(self, a):
         sheet = a.reshape((*a.shape[:-2], self.rows, self.columns, a.shape[-1]))
         wide = jnp.pad(sheet, [(0, 0)] * (sheet.ndim - 3) + [(1, 1), (1, 1), (0, 0)], mode="edge")
-        return self._shifted(lax.optimization_barrier(wide), self.rows + 1, self.columns + 1)
+        return self._slice_shifted(lax.optimization_barrier(wide), self.rows + 1, self.columns + 1)
 
-    def _shifted(self, a, rows, columns):
+    def _slice_shifted(self, a, rows, columns):
         return [a[..., i : i + rows, j : j + columns, :] for i in (0, 1) for j in (0, 1)]
 
 
@@ -63,9 +63,9 @@ class Triangles:
 
     def __init__(self, faces: np.ndarray, nodes: int):
         self.corners, self.nodes = faces.astype(np.int32), nodes
-        place = rank(self.corners.ravel(), nodes)
-        self.around = np.full((int(place.max()) + 1, nodes), len(faces), np.int32)
-        self.around[place, self.corners.ravel()] = np.repeat(np.arange(len(faces)), 3)
+        place = rank_in_group(self.corners.ravel(), nodes)
+        self.node_faces = np.full((int(place.max()) + 1, nodes), len(faces), np.int32)
+        self.node_faces[place, self.corners.ravel()] = np.repeat(np.arange(len(faces)), 3)
         self._hash = hash((nodes, self.corners.tobytes()))
 
     def __eq__(self, other: Any) -> bool:
@@ -82,10 +82,10 @@ class Triangles:
         p, q, r = (take(v, self.corners[:, i]) for i in range(3))
         return 0.5 * cross(b - a, c - a), (p + q + r) / 3
 
-    def gathered(self, newtons: Array) -> Array:
+    def sum_at_nodes(self, newtons: Array) -> Array:
         """The triangles' forces shared among their corners, `(*scenes, nodes, 3)`."""
         shares = jnp.concatenate([newtons / 3, jnp.zeros_like(newtons[..., :1, :])], axis=-2)
-        return sum(take(shares, faces) for faces in self.around)
+        return sum(take(shares, faces) for faces in self.node_faces)
 
 
 class Wind(Force):
@@ -113,12 +113,12 @@ class Wind(Force):
                 "nodes of the sheet that it was made for."
             )
         # each node looks at several faces: apart, or their forces would be computed anew for every one of them
-        return self.surface.gathered(kept_apart(t, lambda: self._pushes(state)))
+        return self.surface.sum_at_nodes(materialise(t, lambda: self._compute_face_forces(state)))
 
-    def _pushes(self, state: Particles) -> Array:
+    def _compute_face_forces(self, state: Particles) -> Array:
         """The force on each face [N]."""
         area, velocity = self.surface.faces(*state)
-        air = over(self.velocity, velocity) - velocity
+        air = broadcast_vector(self.velocity, velocity) - velocity
         outward = unit(area)
         through = dot(air, outward)
         push = scale(self.normal * jnp.abs(through) * through, outward)

@@ -11,20 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.checks import real_quantity
+from physjax.checks import as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.registry import method_name
 from physjax.stepping.simulate import simulate
-from physjax.study.ablation.variants import Removal, removals, two_at_once
-from physjax.study.stability.limits import checked_method
-from physjax.text import seconds_text, table
+from physjax.study.ablation.variants import Variant, list_pair_variants, list_variants
+from physjax.study.stability.limits import check_method
+from physjax.text import format_seconds, format_table
 
 NEEDED, NEGLIGIBLE, COSTLY, NONE = "needed", "negligible", "costs more than it gives", "none"
-BLURRED = "shorter dt"
+UNRESOLVED = "shorter dt"
 """What is left runs too inaccurately to tell, though the whole did not: damping that kept a method stable, say."""
-SAMPLE, FEWEST, ROUNDS = 0.01, 3, 15
+SAMPLE_SECONDS, MIN_SAMPLES, MAX_SAMPLES = 0.01, 3, 15
 """A timing is the least of runs that last so long together [s]; at least and at most so many of each."""
-COSTS = 0.1
+COSTLY_TIME_SHARE = 0.1
 """Part of the run's time from which on a part of the model costs something."""
 
 
@@ -51,7 +51,7 @@ class Effect(NamedTuple):
     def verdict(self) -> str:
         """Needed where any entry of the outcome needs it; none where all do without and cannot tell."""
         found = set(self.verdicts.ravel().tolist())
-        return next(verdict for verdict in (NEEDED, BLURRED, COSTLY, NEGLIGIBLE, NONE) if verdict in found)
+        return next(verdict for verdict in (NEEDED, UNRESOLVED, COSTLY, NEGLIGIBLE, NONE) if verdict in found)
 
 
 class Ablation(NamedTuple):
@@ -59,12 +59,12 @@ class Ablation(NamedTuple):
 
     Printed are the change of the outcome, its numerical error, the share of the run time saved and the flops of a step.
 
-    `whole` is the run with everything; `matters` the change that counts, shaped like the outcome.
+    `whole` is the run with everything; `threshold` the change that counts, shaped like the outcome.
     """
 
     whole: Effect
     effects: tuple[Effect, ...]
-    matters: np.ndarray
+    threshold: np.ndarray
     method: str
     dt: float
     notes: tuple[str, ...]
@@ -76,24 +76,28 @@ class Ablation(NamedTuple):
     def __str__(self) -> str:
         headers = ["without", "changes by", "error", "saves", "flops", "verdict"]
         rows = [
-            [e.name, *map(_number, self.telling(e)[:2]), self._saving(e), _count(e.flops), e.verdict]
+            [
+                e.name,
+                *map(_format_number, self.worst_entry(e)[:2]),
+                self._format_saving(e),
+                _format_count(e.flops),
+                e.verdict,
+            ]
             for e in (self.whole._replace(name="(nothing)"), *self.effects)
         ]
         rows[0][-1] = ""
-        counts = " to ".join(dict.fromkeys(f"{float(edge(self.matters)):.3g}" for edge in (np.min, np.max)))
-        run = (
-            f"{self.method}, dt = {seconds_text(self.dt)}; what counts is a change of the outcome by more than {counts}"
-        )
-        return "\n".join([run, table(headers, rows, align="<>>>><"), *self.notes])
+        counts = " to ".join(dict.fromkeys(f"{float(edge(self.threshold)):.3g}" for edge in (np.min, np.max)))
+        run = f"{self.method}, dt = {format_seconds(self.dt)}; what counts is a change of the outcome by more than {counts}"
+        return "\n".join([run, format_table(headers, rows, align="<>>>><"), *self.notes])
 
-    def telling(self, effect: Effect) -> tuple[float, float, float]:
+    def worst_entry(self, effect: Effect) -> tuple[float, float, float]:
         """Change, numerical error and what counts, for the entry that most exceeds what counts or can be told."""
-        bar = np.maximum(self.matters, effect.numerical)
+        bar = np.maximum(self.threshold, effect.numerical)
         exceeds = np.where(np.isnan(effect.change), np.inf, effect.change) / np.where(bar > 0, bar, 1.0)
         entry = np.unravel_index(np.argmax(exceeds), exceeds.shape)
-        return tuple(float(numbers[entry]) for numbers in (effect.change, effect.numerical, self.matters))
+        return tuple(float(numbers[entry]) for numbers in (effect.change, effect.numerical, self.threshold))
 
-    def _saving(self, effect: Effect) -> str:
+    def _format_saving(self, effect: Effect) -> str:
         if math.isnan(effect.seconds):
             return "not timed"
         if effect.saved == 0:
@@ -146,36 +150,39 @@ def ablate(
     """
     if not callable(outcome):
         raise TypeError(f"outcome: got {outcome!r}, expected a function of the run, e.g. lambda f: f.position[-1, 0].")
-    checked_method(method)
-    real_quantity("dt [s]", dt, above=0.0)  # used as given: a Python 0.01 divides 5 s, the float32 next to it does not
+    check_method(method)
+    as_real_quantity(
+        "dt [s]", dt, above=0.0
+    )  # used as given: a Python 0.01 divides 5 s, the float32 next to it does not
     error, seconds = (
-        float(real_quantity(name, value, at_least=0.0)) for name, value in (("error", error), ("seconds [s]", seconds))
+        float(as_real_quantity(name, value, at_least=0.0))
+        for name, value in (("error", error), ("seconds [s]", seconds))
     )
-    run = partial(_outcomes, outcome, method, dt, duration, save_every)
+    run = partial(_measure_outcome, outcome, method, dt, duration, save_every)
     progress("everything")
-    flight, value, uncertain = run(Removal("everything", scene))
-    found, notes = removals(scene, flight, lanes or {})
-    found += two_at_once(scene) if pairs else []
-    found += [Removal(name, other) for name, other in (others or {}).items()]
+    flight, value, uncertain = run(Variant("everything", scene))
+    found, notes = list_variants(scene, flight, lanes or {})
+    found += list_pair_variants(scene) if pairs else []
+    found += [Variant(name, other) for name, other in (others or {}).items()]
     measured = [(value, uncertain)]
-    for removal in found:
-        progress(f"without {removal.name}")
-        measured.append(run(removal)[1:])
-    scenes = [scene, *(removal.scene for removal in found)]
+    for variant in found:
+        progress(f"without {variant.name}")
+        measured.append(run(variant)[1:])
+    scenes = [scene, *(variant.scene for variant in found)]
     progress("times")
-    times = _times([partial(_run, s, method, dt, flight.steps, save_every) for s in scenes], seconds)
-    matters = np.broadcast_to(error * np.abs(value if scale is None else np.asarray(scale, float)), value.shape)
-    names = ["everything", *(removal.name for removal in found)]
-    costs = [_cost(one, method, dt) for one in scenes]
+    times = _time_runs([partial(_run_scene, s, method, dt, flight.steps, save_every) for s in scenes], seconds)
+    threshold = np.broadcast_to(error * np.abs(value if scale is None else np.asarray(scale, float)), value.shape)
+    names = ["everything", *(variant.name for variant in found)]
+    costs = [_count_step_cost(one, method, dt) for one in scenes]
     effects = [
-        _effect(*each, whole=measured[0], clock=times[0], matters=matters)
+        _compare_with_whole(*each, whole=measured[0], clock=times[0], threshold=threshold)
         for each in zip(names, measured, times, costs, strict=True)
     ]
-    return Ablation(effects[0], tuple(effects[1:]), matters, method_name(method), float(dt), tuple(notes))
+    return Ablation(effects[0], tuple(effects[1:]), threshold, method_name(method), float(dt), tuple(notes))
 
 
-def _effect(
-    name: str, measured: tuple, timed: tuple, cost: tuple, *, whole: tuple, clock: tuple, matters: np.ndarray
+def _compare_with_whole(
+    name: str, measured: tuple, timed: tuple, cost: tuple, *, whole: tuple, clock: tuple, threshold: np.ndarray
 ) -> Effect:
     """What leaving out did: outcome and its error, time and its spread, beside those of the whole."""
     (now, off), (value, uncertain) = measured, whole
@@ -184,26 +191,26 @@ def _effect(
     numerical, change = np.maximum(off, uncertain), np.abs(now - value)
     saved, spread = clock[0] - timed[0], max(timed[1], clock[1])
     saved = saved if abs(saved) > spread else 0.0
-    verdicts = _verdicts(change, uncertain, off, matters, saved > COSTS * clock[0])
+    verdicts = _judge_entries(change, uncertain, off, threshold, saved > COSTLY_TIME_SHARE * clock[0])
     return Effect(name, now, change, numerical, timed[0], saved, spread, *cost, verdicts)
 
 
-def _verdicts(
-    change: np.ndarray, uncertain: np.ndarray, off: np.ndarray, matters: np.ndarray, costs: bool
+def _judge_entries(
+    change: np.ndarray, uncertain: np.ndarray, off: np.ndarray, threshold: np.ndarray, costs: bool
 ) -> np.ndarray:
     """A verdict for each entry, by the numerical errors of the whole and without; a change that is no number is needed."""
-    little = np.where(change <= matters, COSTLY if costs else NEGLIGIBLE, NEEDED)
-    cannot_tell = np.where((off > matters) & (uncertain <= matters) & (matters > 0), BLURRED, NONE)
+    little = np.where(change <= threshold, COSTLY if costs else NEGLIGIBLE, NEEDED)
+    cannot_tell = np.where((off > threshold) & (uncertain <= threshold) & (threshold > 0), UNRESOLVED, NONE)
     return np.where(change <= np.maximum(off, uncertain), cannot_tell, little)
 
 
-def _run(scene: Scene, method: Callable, dt: float, steps: int, save_every: int) -> Any:
+def _run_scene(scene: Scene, method: Callable, dt: float, steps: int, save_every: int) -> Any:
     flight = simulate(scene, method, dt=dt, steps=steps, save_every=save_every)
     return jax.block_until_ready(flight.final_scene.state)
 
 
-def _outcomes(
-    outcome: Callable, method: Callable, dt: float, duration: float, save_every: int, removal: Removal
+def _measure_outcome(
+    outcome: Callable, method: Callable, dt: float, duration: float, save_every: int, variant: Variant
 ) -> tuple[Any, np.ndarray, np.ndarray]:
     """The run, its outcome, and the outcome's numerical error by Richardson's comparison with shorter steps.
 
@@ -211,40 +218,40 @@ def _outcomes(
     What is answered at the end of a step may happen to be answered at the same moment in half the step: there the run is
     also compared with one whose steps end elsewhere.
     """
-    scene = removal.scene
+    scene = variant.scene
     late = scene.resolves_at_step_end
     flight = simulate(scene, method, dt=dt, duration=duration, save_every=save_every)
     frames, runs = flight.steps // save_every, [flight]
     for every in (2 * save_every, *([2 * save_every + 1] if late else [])):
         runs.append(simulate(scene, method, dt=dt * save_every / every, steps=frames * every, save_every=every))
-    seen = [eqx.tree_at(lambda run: run.state, one, removal.whole(one.state)) for one in runs]
+    seen = [eqx.tree_at(lambda run: run.state, one, variant.restore_states(one.state)) for one in runs]
     value, *finer = (np.asarray(outcome(one), float) for one in seen)
     rounding = float(jnp.finfo(flight.position.dtype).eps) * math.sqrt(flight.steps) * np.abs(value)
     return flight, value, 2 * np.max([np.abs(value - better) for better in finer], axis=0) + rounding
 
 
-def _times(runs: list[Callable], seconds: float) -> list[tuple[float, float]]:
+def _time_runs(runs: list[Callable], seconds: float) -> list[tuple[float, float]]:
     """The least time of each run [s] and its spread, from the least to the lower quartile; all take turns."""
     if seconds == 0:
         return [(math.nan, math.nan)] * len(runs)
     counts = []
     for run in runs:
         run()
-        counts.append(max(1, math.ceil(SAMPLE / _seconds(run))))
+        counts.append(max(1, math.ceil(SAMPLE_SECONDS / _time_run(run))))
     taken, begun = [[] for _ in runs], time.perf_counter()
-    while len(taken[0]) < FEWEST or (len(taken[0]) < ROUNDS and time.perf_counter() - begun < seconds):
+    while len(taken[0]) < MIN_SAMPLES or (len(taken[0]) < MAX_SAMPLES and time.perf_counter() - begun < seconds):
         for run, count, times in zip(runs, counts, taken, strict=True):
-            times.append(min(_seconds(run) for _ in range(count)))
+            times.append(min(_time_run(run) for _ in range(count)))
     return [(min(times), float(np.quantile(times, 0.25)) - min(times)) for times in taken]
 
 
-def _seconds(run: Callable) -> float:
+def _time_run(run: Callable) -> float:
     started = time.perf_counter()
     run()
     return time.perf_counter() - started
 
 
-def _cost(scene: Scene, method: Callable, dt: float) -> tuple[float, float]:
+def _count_step_cost(scene: Scene, method: Callable, dt: float) -> tuple[float, float]:
     """Floating-point operations and bytes of one compiled step, as the compiler counts them."""
     step = jax.jit(lambda scene, t, dt: scene.step(method, t, dt))
     numbers = (jnp.asarray(number, scene.state.dtype) for number in (0.0, dt))
@@ -252,9 +259,9 @@ def _cost(scene: Scene, method: Callable, dt: float) -> tuple[float, float]:
     return float(counted.get("flops", math.nan)), float(counted.get("bytes accessed", math.nan))
 
 
-def _number(amount: float) -> str:
+def _format_number(amount: float) -> str:
     return f"{amount:.3g}"
 
 
-def _count(number: float) -> str:
+def _format_count(number: float) -> str:
     return f"{number:.4g}"

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-COLOURS = {
+VERDICT_COLOURS = {
     "needed": "#D55E00",
     "shorter dt": "#E69F00",
     "costs more than it gives": "#CC79A7",
@@ -22,8 +22,8 @@ def draw_ablation(result: Any, figure: Any = None) -> Any:
     timed = not np.isnan(result.whole.seconds)
     figure = figure or plt.figure(figsize=(9, 1.7 + 0.36 * len(effects)), layout="constrained")
     panels = figure.subplots(1, 1 + timed, sharey=True, squeeze=False, width_ratios=(3, 1)[: 1 + timed])[0]
-    places, colours = np.arange(len(effects)), [COLOURS[effect.verdict] for effect in effects]
-    _changes(panels[0], result, places, colours)
+    places, colours = np.arange(len(effects)), [VERDICT_COLOURS[effect.verdict] for effect in effects]
+    _draw_changes(panels[0], result, places, colours)
     panels[0].set_yticks(places, [effect.name for effect in effects])
     panels[0].set_ylim(len(effects) - 0.4, -0.6)
     if timed:
@@ -33,18 +33,18 @@ def draw_ablation(result: Any, figure: Any = None) -> Any:
         panels[1].set(xlabel="time saved [%]")
         panels[1].grid(axis="x", color="0.9")
         panels[1].set_axisbelow(True)
-    shown = [verdict for verdict in COLOURS if verdict in {effect.verdict for effect in effects}]
-    handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[verdict], label=verdict) for verdict in shown]
+    shown = [verdict for verdict in VERDICT_COLOURS if verdict in {effect.verdict for effect in effects}]
+    handles = [plt.Rectangle((0, 0), 1, 1, color=VERDICT_COLOURS[verdict], label=verdict) for verdict in shown]
     handles.append(plt.Line2D([], [], color="black", marker="|", linestyle="", markersize=11, label="numerical error"))
     handles.append(plt.Line2D([], [], color="black", linestyle="--", label="what counts"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
-def _changes(ax: Any, result: Any, places: np.ndarray, colours: list[str]) -> None:
+def _draw_changes(ax: Any, result: Any, places: np.ndarray, colours: list[str]) -> None:
     """Bars of the largest changes in units of what counts; what is zero, or no number, is written out."""
-    relative = bool(np.all(result.matters > 0))
-    change, numerical, unit = np.array([result.telling(effect) for effect in result.effects]).T
+    relative = bool(np.all(result.threshold > 0))
+    change, numerical, unit = np.array([result.worst_entry(effect) for effect in result.effects]).T
     change, numerical = (change / unit, numerical / unit) if relative else (change, numerical)
     known = np.concatenate([change, numerical, [1.0]])
     known = known[np.isfinite(known) & (known > 0)]

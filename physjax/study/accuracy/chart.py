@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from physjax.show.plot import MOST_LANES, draw_paths
-from physjax.show.style import PROJECTED, style
-from physjax.text import seconds_text
+from physjax.show.plot import MAX_DRAWN_LANES, draw_paths
+from physjax.show.style import PROJECTED_SUFFIX, style
+from physjax.text import format_seconds
 
-BAND = {"color": "#F0E442", "linewidth": 9, "alpha": 0.5, "solid_capstyle": "round"}
+FRONT_BAND_STYLE = {"color": "#F0E442", "linewidth": 9, "alpha": 0.5, "solid_capstyle": "round"}
 """Pareto's front."""
 
 
@@ -23,7 +23,7 @@ def draw_work_precision(result: Any, figure: Any = None) -> Any:
 
     more = bool(result.gradients or result.norms)
     figure = figure or plt.figure(figsize=(11, 13 if more else 9))
-    bottom = _below(figure, result)
+    bottom = _draw_legend(figure, result)
     grid = {
         "left": 0.08,
         "right": 0.98,
@@ -34,45 +34,45 @@ def draw_work_precision(result: Any, figure: Any = None) -> Any:
     }
     panels = figure.subplots(2 + more, 2, gridspec_kw=grid)
     copies = f", {result.batch:,} copies at once" if result.batch > 1 else ""
-    title = f"{result.name.replace('_', ' ')}: {seconds_text(result.duration)}, {result.dtype}{copies}"
+    title = f"{result.name.replace('_', ' ')}: {format_seconds(result.duration)}, {result.dtype}{copies}"
     figure.suptitle(title, fontsize=14)
     time, position = result.path
     seen = position.reshape(position.shape[0], -1, position.shape[-1])[..., :2]  # space is seen from above
-    draw_paths(time, seen, math.ceil(seen.shape[1] / MOST_LANES), None, panels[0, 0]).set_title(
+    draw_paths(time, seen, math.ceil(seen.shape[1] / MAX_DRAWN_LANES), None, panels[0, 0]).set_title(
         f"the path ({result.truth})", fontsize=11
     )
     if math.isfinite(result.horizon):
         _mark_horizon(panels[0, 0], time, seen, result.horizon)
 
     ax = panels[0, 1]
-    _curves(ax, result, "seconds", "path_error")
+    _draw_curves(ax, result, "seconds", "path_error")
     ax.set(xlabel="run time [s]", ylabel="largest error on the path [path extent]")
     ax.set_title("speed against accuracy: lower left is better", fontsize=11)
-    _band(ax, result.front)
+    _draw_front(ax, result.front)
 
     ax = panels[1, 0]
-    _curves(ax, result, "dt", "path_error")
+    _draw_curves(ax, result, "dt", "path_error")
     ax.set(xlabel="step dt [s]", ylabel="largest error on the path [path extent]")
     ax.set_title("order: the slope of each line", fontsize=11)
 
     ax = panels[1, 1]
     if result.conserved:
-        _curves(ax, result, "dt", "drift")
+        _draw_curves(ax, result, "dt", "drift")
         ax.set(xlabel="step dt [s]", ylabel=f"largest change of the {result.conserved[0]} [relative]")
         ax.set_title(f"what must be kept: {result.conserved[0]}", fontsize=11)
     else:
-        _curves(ax, result, "evaluations", "path_error")
+        _draw_curves(ax, result, "evaluations", "path_error")
         ax.set(xlabel="force evaluations", ylabel="largest error on the path [path extent]")
         ax.set_title("the same on any machine: error against evaluations", fontsize=11)
     if more:
-        _more(panels[2], result)
+        _draw_more_panels(panels[2], result)
     return figure
 
 
-def _band(ax: Any, front: Any) -> None:
+def _draw_front(ax: Any, front: Any) -> None:
     """Pareto's front, behind the lines."""
     across, up = [run.seconds for run in front], [max(run.path_error, 1e-17) for run in front]
-    ax.plot(across, up, **BAND, zorder=0)
+    ax.plot(across, up, **FRONT_BAND_STYLE, zorder=0)
 
 
 def _mark_horizon(ax: Any, time: np.ndarray, position: np.ndarray, horizon: float) -> None:
@@ -81,39 +81,39 @@ def _mark_horizon(ax: Any, time: np.ndarray, position: np.ndarray, horizon: floa
         ax.axvline(horizon, color="0.2", linestyle="--")
     else:
         ax.plot(*position[np.searchsorted(time, horizon)].T, "o", color="0.2", markerfacecolor="white")
-    words = f"chaos: beyond {seconds_text(horizon)} (marked) errors mean nothing"
+    words = f"chaos: beyond {format_seconds(horizon)} (marked) errors mean nothing"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1}
     ax.annotate(words, (0.02, 0.02), xycoords="axes fraction", fontsize=8.5, bbox=box)
 
 
-def _more(panels: Any, result: Any) -> None:
+def _draw_more_panels(panels: Any, result: Any) -> None:
     """Gradient error against gradient cost, and the first of the other norms against time."""
     left, right = panels
     if result.gradients:
-        _curves(left, result._replace(runs=result.gradients, floor=0.0), "seconds", "path_error")
+        _draw_curves(left, result._replace(runs=result.gradients, floor=0.0), "seconds", "path_error")
         left.set(xlabel="time of path and derivative [s]", ylabel="largest error of the derivative [its largest]")
         left.set_title("gradient error against gradient cost", fontsize=11)
     if result.norms:
         # as drifts are drawn: the number stands in a place of its own
         swapped = [run._replace(path_error=run.errors[0]) for run in result.runs]
-        _curves(right, result._replace(runs=tuple(swapped), floor=0.0), "seconds", "path_error")
+        _draw_curves(right, result._replace(runs=tuple(swapped), floor=0.0), "seconds", "path_error")
         right.set(xlabel="run time [s]", ylabel=f"error of {result.norms[0]} [relative]")
         right.set_title(f"another norm: {result.norms[0]}", fontsize=11)
     for ax, there in ((left, result.gradients), (right, result.norms)):
         ax.set_visible(bool(there))
 
 
-def _below(figure: Any, result: Any) -> float:
+def _draw_legend(figure: Any, result: Any) -> float:
     """The legend, which stands below the panels; returns the share of the figure's height that they must leave to it."""
     from matplotlib import pyplot as plt
 
     # where both treatments of contacts ran, each has a column of its own, a method to a line
-    methods = sorted(result.methods, key=lambda method: method.endswith(PROJECTED))
-    projected = methods[-1].endswith(PROJECTED)
-    handles = [plt.Line2D([], [], **style(method), label=_legend(result, method)) for method in methods]
+    methods = sorted(result.methods, key=lambda method: method.endswith(PROJECTED_SUFFIX))
+    projected = methods[-1].endswith(PROJECTED_SUFFIX)
+    handles = [plt.Line2D([], [], **style(method), label=_format_label(result, method)) for method in methods]
     failed = plt.Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
     handles.insert(len(methods) // 2 if projected else len(methods), failed)
-    handles.append(plt.Line2D([], [], **BAND, label="Pareto's front"))
+    handles.append(plt.Line2D([], [], **FRONT_BAND_STYLE, label="Pareto's front"))
     columns = 2 if projected else 3
     what = (
         "solid: impacts found inside the step; dashed, hollow: projected at the end of the step" if projected else None
@@ -131,13 +131,13 @@ def _below(figure: Any, result: Any) -> float:
     return high * max(0.17, 0.07 + 0.023 * (projected + math.ceil(len(handles) / columns)))
 
 
-def _curves(ax: Any, result: Any, x: str, y: str) -> None:
+def _draw_curves(ax: Any, result: Any, x: str, y: str) -> None:
     """A line for each method through the runs that held, and crosses on the upper edge for those that failed."""
     for method in result.methods:
         runs = [run for run in result.of(method) if getattr(run, x) is not None]
         good = [run for run in runs if run.status == "ok"]
         line = style(method)
-        ax.plot([getattr(run, x) for run in good], [max(_value(run, y), 1e-17) for run in good], **line)
+        ax.plot([getattr(run, x) for run in good], [max(_read_value(run, y), 1e-17) for run in good], **line)
         failed = [getattr(run, x) for run in runs if run.status != "ok"]
         edge = ax.get_xaxis_transform()
         ax.plot(failed, [0.975] * len(failed), "x", color=line["color"], transform=edge, markersize=6, clip_on=False)
@@ -152,11 +152,11 @@ def _curves(ax: Any, result: Any, x: str, y: str) -> None:
     ax.grid(which="major", color="0.9")
 
 
-def _value(run: Any, y: str) -> float:
+def _read_value(run: Any, y: str) -> float:
     return run.drifts[0] if y == "drift" else getattr(run, y)
 
 
-def _legend(result: Any, method: str) -> str:
+def _format_label(result: Any, method: str) -> str:
     if method not in result.promised:
         return f"{method} (adaptive)"
     order = result.observed_order(method)

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.scene import Scene
-from physjax.stepping.reference import in_dtype
+from physjax.stepping.reference import cast_floats
 from physjax.study.energy.quantities import ENERGY, MOMENTUM, Conserved
 
 
-class Norm(NamedTuple):
+class ErrorMeasure(NamedTuple):
     """A way to measure errors: `quantity(scene, times, states)` of a run less that of the true path, over its `size`.
 
     The quantity is NumPy, `(moments, *units, components)`; `size(scene, times, states)` is that of the true path, a
@@ -52,64 +52,64 @@ def extent(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
     return away.max(axis=-1, keepdims=True) if scene.couples else away
 
 
-def _place(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+def _positions(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
     return np.asarray(states.place, float)
 
 
-def _last_place(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
-    return _place(scene, times, states)[-1:]
+def _final_positions(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+    return _positions(scene, times, states)[-1:]
 
 
 @partial(jax.jit, static_argnames="function")
-def _over_time(function: Callable, scene: Scene, times: Any, states: Any) -> Any:
+def _map_over_time(function: Callable, scene: Scene, times: Any, states: Any) -> Any:
     return jax.vmap(lambda t, state: function(scene, t, state))(times, states)
 
 
-def _series(function: Callable, scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
+def _evaluate_over_time(function: Callable, scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
     """A function of the state at every moment."""
     with jax.enable_x64(True):
         states = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), states)
-        return np.asarray(_over_time(function, in_dtype(scene, jnp.float64), jnp.asarray(times), states))
+        return np.asarray(_map_over_time(function, cast_floats(scene, jnp.float64), jnp.asarray(times), states))
 
 
-def _kept(conserved: Conserved) -> Norm:
+def _build_conserved_measure(conserved: Conserved) -> ErrorMeasure:
     """The error of a quantity, relative to the largest size it has on the true path."""
 
     def value(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
-        found = _series(conserved.value, scene, times, states)
+        found = _evaluate_over_time(conserved.value, scene, times, states)
         return found[..., None] if found.ndim == 1 + len(scene.status_shape) else found
 
     def size(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
-        return _series(conserved.size, scene, times, states).max(axis=0)
+        return _evaluate_over_time(conserved.size, scene, times, states).max(axis=0)
 
-    return Norm(conserved.name, value, size)
+    return ErrorMeasure(conserved.name, value, size)
 
 
-def _depth(scene: Scene, t: Any, state: Any) -> Any:
+def _penetration_depth(scene: Scene, t: Any, state: Any) -> Any:
     """How far each lane has sunk into the contact it is deepest in [m]."""
     if not scene.contacts:
         raise ValueError("penetration: the scene has no contacts, so nothing can sink in. Ask for another norm.")
     # corners of other nodes are looked at only where a contact has them; a gap may have an axis of its own
-    depths = [jnp.maximum(0.0, -contact.gap(t, state.position)) for contact in scene.contacts]
+    depths = [jnp.maximum(0.0, -contact.signed_distance(t, state.position)) for contact in scene.contacts]
     deepest = depths[0]
     for depth in depths[1:]:
         deepest = jnp.maximum(deepest, depth)
     return deepest[..., None]
 
 
-path = Norm("path", _place, extent)
+path = ErrorMeasure("path", _positions, extent)
 """Largest distance from the true path at any moment, in parts of how far the true path goes."""
-final = Norm("final", _last_place, extent)
+final = ErrorMeasure("final", _final_positions, extent)
 """The same at the last moment alone."""
-energy = _kept(ENERGY)
+energy = _build_conserved_measure(ENERGY)
 """Total energy against the true path's, in parts of the largest kinetic energy."""
-momentum = _kept(MOMENTUM)
+momentum = _build_conserved_measure(MOMENTUM)
 """Total momentum against the true path's, in parts of the largest Σm|v|."""
-penetration = Norm("penetration", partial(_series, _depth), extent)
+penetration = ErrorMeasure("penetration", partial(_evaluate_over_time, _penetration_depth), extent)
 """How far anything sinks into a contact, less what it does on the true path, in parts of how far that goes."""
 
 
-def outcome(function: Callable, name: str | None = None) -> Norm:
+def outcome(function: Callable, name: str | None = None) -> ErrorMeasure:
     """What you look at: `function(times, states) -> number or array`; its error in parts of its own largest value.
 
     Example:
@@ -122,20 +122,20 @@ def outcome(function: Callable, name: str | None = None) -> Norm:
     def value(scene: Scene, times: np.ndarray, states: Any) -> np.ndarray:
         return np.asarray(function(times, states), float).reshape(1, 1, -1)
 
-    return Norm(
+    return ErrorMeasure(
         name or getattr(function, "__name__", "outcome"),
         value,
         lambda scene, times, states: np.abs(value(scene, times, states)).max(),
     )
 
 
-NORMS = (path, final, energy, momentum, penetration)
+ERROR_MEASURES = (path, final, energy, momentum, penetration)
 """The norms that every scene has (the last one only with contacts)."""
 
 
-def as_norm(norm: Any) -> Norm:
+def as_error_measure(norm: Any) -> ErrorMeasure:
     """A norm, or a function (times, states) of the user's as one."""
-    if isinstance(norm, Norm):
+    if isinstance(norm, ErrorMeasure):
         return norm
     if not callable(norm):
         raise TypeError(

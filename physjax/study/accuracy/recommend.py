@@ -11,44 +11,44 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.adaptive import adaptive
 from physjax.stepping.methods import METHODS, rk4
-from physjax.stepping.reference import in_dtype
+from physjax.stepping.reference import cast_floats
 from physjax.stepping.simulate import simulate
-from physjax.study.accuracy.error_measures import Norm, as_norm, path
+from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure, path
 from physjax.study.accuracy.method_facts import (
-    Contender,
-    contender,
+    CompiledRun,
+    compile_run,
     depends_on_velocity,
+    draw_random_push,
+    method_title,
     promised_order,
-    random_push,
-    title_of,
 )
-from physjax.study.accuracy.reference_solution import yardstick
+from physjax.study.accuracy.reference_solution import solve_reference
 from physjax.study.accuracy.search import (
-    LONG,
-    Explored,
-    Question,
+    MAX_RUN_SECONDS,
+    Exploration,
+    SearchTask,
     Trial,
-    explored,
-    refined,
-    second_opinion,
-    timed_in_turn,
-    tried,
+    estimate_richardson_error,
+    explore_method,
+    refine_step,
+    run_trial,
+    time_in_turn,
 )
 from physjax.study.problem import Problem
-from physjax.text import progress_bar, seconds_text, table
+from physjax.text import format_seconds, format_table, progress_bar
 from physjax.trajectory import Trajectory
 
-SURE = {"float64": 0.9, "float32": 0.6}
+SAFE_ERROR_SHARE = {"float64": 0.9, "float32": 0.6}
 """The part of an error that a run may have to be recommended; rounding differs from one compilation to the next."""
-KNOWN = 0.3
+TRUTH_ERROR_SHARE = 0.3
 """An error can be promised if the truth itself is right to this part of it."""
-CHAOTIC = 1e6
+CHAOTIC_GROWTH = 1e6
 """So many times an error of the start has grown where one speaks of chaos; what drifts apart in time stays below."""
-FINALISTS, CLOSE = 3, 4.0
+MAX_FINALISTS, FINALIST_TIME_RATIO = 3, 4.0
 """Methods that are verified and timed for an error, by what their runs predict, if not so many times slower than others."""
 
 
@@ -70,14 +70,14 @@ class Choice(NamedTuple):
     @property
     def step(self) -> str:
         """Step or tolerance in words."""
-        return seconds_text(self.dt) if self.tolerance is None else f"tolerance {self.tolerance:.1e}"
+        return format_seconds(self.dt) if self.tolerance is None else f"tolerance {self.tolerance:.1e}"
 
 
 class Recommendation(NamedTuple):
     """What to run for an error over a horizon [s], why, and what else would do. Printed, it is a table and a sentence.
 
     `best` is None, and `reason` says what stops it, where nothing keeps the error. `richardson` is the error of the best
-    as its own run with half the step tells it, `doubt` that of the truth; `untried` the methods for which there was no
+    as its own run with half the step tells it, `truth_error` that of the truth; `untried` the methods for which there was no
     time.
     """
 
@@ -90,7 +90,7 @@ class Recommendation(NamedTuple):
     runners_up: tuple[Choice, ...]
     reason: str
     truth: str
-    doubt: float
+    truth_error: float
     richardson: float
     untried: tuple[str, ...]
 
@@ -103,9 +103,9 @@ class Recommendation(NamedTuple):
     def evidence(self) -> str:
         """How the error of the best is known."""
         if self.best is None:
-            return f"truth: {self.truth}, itself right to {self.doubt:.1e}"
-        told = "" if np.isnan(self.richardson) else f"; against its own half step it reads {self.richardson:.1e}"
-        return f"{self.best.error:.1e} measured against {self.truth}, itself right to {self.doubt:.1e}{told}"
+            return f"truth: {self.truth}, itself right to {self.truth_error:.1e}"
+        remarks = "" if np.isnan(self.richardson) else f"; against its own half step it reads {self.richardson:.1e}"
+        return f"{self.best.error:.1e} measured against {self.truth}, itself right to {self.truth_error:.1e}{remarks}"
 
     def simulate(self, **options: Any) -> Trajectory:
         """Run the scene as recommended, over the horizon; options as for `simulate`. ValueError where nothing keeps the error."""
@@ -113,18 +113,20 @@ class Recommendation(NamedTuple):
             raise ValueError(f"recommend: nothing keeps an error of {self.error:g}: {self.reason}")
         best, steps = self.best, self.best.steps_per_frame
         with jax.enable_x64(best.dtype == "float64"):
-            scene = in_dtype(self.scene, best.dtype)
+            scene = cast_floats(self.scene, best.dtype)
             options = {"save_every": steps} | options
             return simulate(scene, best.method, dt=best.dt, steps=steps * self.frames, **options)
 
     def __str__(self) -> str:
-        title = f"error {self.error:g} ({self.norm}) over {seconds_text(self.horizon)}"
+        title = f"error {self.error:g} ({self.norm}) over {format_seconds(self.horizon)}"
         rows = [
-            [c.name, c.dtype, c.step, f"{c.error:.1e}", seconds_text(c.seconds)]
+            [c.name, c.dtype, c.step, f"{c.error:.1e}", format_seconds(c.seconds)]
             for c in (self.best, *self.runners_up)
             if c is not None
         ]
-        body = [table(["method", "float", "step", "error", "run time per s"], rows, align="<<>>>")] if rows else []
+        body = (
+            [format_table(["method", "float", "step", "error", "run time per s"], rows, align="<<>>>")] if rows else []
+        )
         rest = [f"Not tried for lack of time: {', '.join(self.untried)}."] if self.untried else []
         return "\n".join([title, *body, f"{self.reason}", f"Evidence: {self.evidence}.", *rest])
 
@@ -134,7 +136,7 @@ def recommend(
     *,
     error: float | Sequence[float],
     horizon: float,
-    norm: Norm | Callable = path,
+    norm: ErrorMeasure | Callable = path,
     gradient: bool = False,
     scale: Any = None,
     methods: Sequence[Callable] | None = None,
@@ -162,163 +164,177 @@ def recommend(
         >>> advice.best.name, advice.best.error < 1e-3
         ('verlet', True)
     """
-    problem, errors = _asked(scene, error, horizon, frames)
-    norm, dtypes = as_norm(norm), [np.dtype(dtype).name for dtype in dtypes]
-    deadline = time.process_time() + float(real_quantity("seconds [s]", seconds, above=0.0))
+    problem, errors = _check_request(scene, error, horizon, frames)
+    norm, dtypes = as_error_measure(norm), [np.dtype(dtype).name for dtype in dtypes]
+    deadline = time.process_time() + float(as_real_quantity("seconds [s]", seconds, above=0.0))
     with jax.enable_x64(True), progress_bar(progress=progress, desc="recommend", unit="method", leave=False) as shown:
         shown.set_postfix_str("the true path")
-        push = random_push(scene) if gradient else None
-        truth = yardstick(problem, wanted=min(errors), seconds=seconds / 5, push=push)
-        question = Question(problem, truth, norm, scale, push, deadline)
-        doubt = float(truth.doubt(norm, scale).max())
-        found, untried = _explored_all(
-            question, candidates(scene) if methods is None else list(methods), min(errors), shown
+        push = draw_random_push(scene) if gradient else None
+        truth = solve_reference(problem, wanted=min(errors), seconds=seconds / 5, push=push)
+        task = SearchTask(problem, truth, norm, scale, push, deadline)
+        truth_error = float(truth.truth_error(norm, scale).max())
+        found, untried = _explore_methods(
+            task, list_candidates(scene) if methods is None else list(methods), min(errors), shown
         )
         answers, compiled = [], {}
         for wanted in errors:
             shown.set_postfix_str(f"error {wanted:g}")
-            kept = _kept(question, found, wanted, doubt, dtypes, compiled) if doubt < KNOWN * wanted else []
-            answers.append(_answer(question, found, kept, wanted, doubt, untried))
+            kept = (
+                _verify_finalists(task, found, wanted, truth_error, dtypes, compiled)
+                if truth_error < TRUTH_ERROR_SHARE * wanted
+                else []
+            )
+            answers.append(_build_recommendation(task, found, kept, wanted, truth_error, untried))
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
 
 
-def _asked(scene: Scene, error: Any, horizon: float, frames: int) -> tuple[Problem, list[float]]:
+def _check_request(scene: Scene, error: Any, horizon: float, frames: int) -> tuple[Problem, list[float]]:
     if not isinstance(scene, Scene):
         raise TypeError(f"recommend: got a {type(scene).__name__}, expected a Scene.")
-    real_quantity("error", error, above=0.0)
+    as_real_quantity("error", error, above=0.0)
     errors = np.atleast_1d(np.asarray(error, float))  # as given: outside float64 an array has other numbers
     if errors.ndim != 1 or not errors.size:
         raise ValueError(f"error: got an array of shape {errors.shape}, expected a number or a list of them.")
-    span = real_quantity("horizon [s]", horizon, above=0.0)
+    span = as_real_quantity("horizon [s]", horizon, above=0.0)
     if span.ndim:
         raise ValueError(f"horizon [s]: got shape {span.shape}, expected one number.")
-    return Problem(scene, float(horizon), frames=positive_integer("frames", frames)), [float(e) for e in errors]
+    return Problem(scene, float(horizon), frames=as_positive_integer("frames", frames)), [float(e) for e in errors]
 
 
-def candidates(scene: Scene) -> list[Callable]:
+def list_candidates(scene: Scene) -> list[Callable]:
     """Methods for a scene in the order in which they are tried: what is likely to win first, what cannot win not at all."""
     late, pulled = scene.resolves_at_step_end, depends_on_velocity(scene)
 
     def merit(method):
         promises = method.promises
-        return promised_order(method, pulled, scene), -promises.evaluations, min(promises.stable_to, 1e6)
+        return promised_order(method, pulled, scene), -promises.evaluations, min(promises.stability_limit, 1e6)
 
     chosen = []
     # what is implicit does not end by stability and costs more than its promise says: last
-    for method in sorted(METHODS.values(), key=lambda m: (_implicit(m), *(-x for x in merit(m)))):
+    for method in sorted(METHODS.values(), key=lambda m: (_is_implicit(m), *(-x for x in merit(m)))):
         if not any(all(a >= b for a, b in zip(merit(other), merit(method), strict=True)) for other in chosen):
             chosen.append(method)
     return chosen if late else [*chosen[:2], adaptive(rk4), *chosen[2:]]
 
 
-def _explored_all(question: Question, methods: Sequence, least: float, bar: Any) -> tuple[list, tuple[str, ...]]:
+def _explore_methods(task: SearchTask, methods: Sequence, least: float, bar: Any) -> tuple[list, tuple[str, ...]]:
     """The runs of every method, as long as there is time, and the names of those for which there was none."""
-    found: list[Explored] = []
+    found: list[Exploration] = []
     untried, longest = [], 0.0
     for method in methods:
-        name = title_of(method)
+        name = method_title(method)
         bar.set_postfix_str(name)
-        if _implicit(method) and not any(np.isfinite(entry.holds) for entry in found if entry.trials) and found:
+        if (
+            _is_implicit(method)
+            and not any(np.isfinite(entry.longest_stable_step) for entry in found if entry.trials)
+            and found
+        ):
             continue  # no step was too long for the others, so stability costs nothing here
         # as much again is needed to verify
-        if found and 2 * longest > question.left():
+        if found and 2 * longest > task.time_left():
             untried.append(name)
             continue
         started = time.process_time()
-        entry = contender(question.problem, method, push=question.push)
-        found.append(explored(question, entry, least, found, _first(found, entry)))
+        entry = compile_run(task.problem, method, push=task.push)
+        found.append(explore_method(task, entry, least, found, _guess_fineness(found, entry)))
         longest = max(longest, time.process_time() - started)
         bar.update()
     return found, tuple(untried)
 
 
-def _implicit(method: Any) -> bool:
+def _is_implicit(method: Any) -> bool:
     promises = getattr(method, "promises", None)
-    return promises is not None and bool(np.isinf(promises.stable_to))
+    return promises is not None and bool(np.isinf(promises.stability_limit))
 
 
-def _first(found: Sequence[Explored], entry: Contender) -> float:
+def _guess_fineness(found: Sequence[Exploration], entry: CompiledRun) -> float:
     """The coarsest number of steps worth a run: twice as long as the longest that held for a method like it."""
     reach = lambda method: getattr(getattr(method, "promises", None), "stable_to", 0.0)  # noqa: E731
     mine = reach(entry.method)
     limits = [
-        e.holds * mine / reach(e.contender.method) for e in found if np.isfinite(e.holds) and reach(e.contender.method)
+        e.longest_stable_step * mine / reach(e.compiled_run.method)
+        for e in found
+        if np.isfinite(e.longest_stable_step) and reach(e.compiled_run.method)
     ]
     spacing = entry.problem.duration / entry.problem.frames
     return max(1.0, float(2.0 ** np.floor(np.log2(spacing / min(limits) / 2)))) if limits and 0 < mine < np.inf else 1.0
 
 
-def _kept(
-    question: Question, found: list[Explored], wanted: float, doubt: float, dtypes: Sequence[str], compiled: dict
-) -> list[tuple[Contender, Trial]]:
+def _verify_finalists(
+    task: SearchTask, found: list[Exploration], wanted: float, truth_error: float, dtypes: Sequence[str], compiled: dict
+) -> list[tuple[CompiledRun, Trial]]:
     """The runs that keep an error, at most one of each method and float type, of those that may be the fastest."""
-    goals = {dtype: SURE[dtype] * wanted - doubt for dtype in SURE}
+    goals = {dtype: SAFE_ERROR_SHARE[dtype] * wanted - truth_error for dtype in SAFE_ERROR_SHARE}
     ranked = sorted(range(len(found)), key=lambda i: found[i].seconds(found[i].fineness(goals["float64"])))
     kept, most = [], np.inf
-    for i in ranked[:FINALISTS]:
-        found[i], trial = refined(question, found[i], goals["float64"], min(most, 4 * LONG))
+    for i in ranked[:MAX_FINALISTS]:
+        found[i], trial = refine_step(task, found[i], goals["float64"], min(most, 4 * MAX_RUN_SECONDS))
         if trial is None:
             continue
-        most = min(most, CLOSE * trial.seconds)
+        most = min(most, FINALIST_TIME_RATIO * trial.seconds)
         if "float64" in dtypes:
-            kept.append((found[i].contender, trial))
-        if "float32" in dtypes and _worth_float32(question, wanted):
-            kept += _in_float32(question, found[i], trial, goals["float32"], compiled)
+            kept.append((found[i].compiled_run, trial))
+        if "float32" in dtypes and _is_float32_accurate(task, wanted):
+            kept += _try_float32(task, found[i], trial, goals["float32"], compiled)
     return kept
 
 
-def _worth_float32(question: Question, wanted: float) -> bool:
+def _is_float32_accurate(task: SearchTask, wanted: float) -> bool:
     """Whether rounding in float32, grown as errors of the start grow, stays below the error."""
     eps = float(np.finfo(np.float32).eps)
-    return float(question.truth.growth(question.norm, question.scale).max(initial=1.0)) * eps < wanted
+    return float(task.truth.growth(task.norm, task.scale).max(initial=1.0)) * eps < wanted
 
 
-def _in_float32(question: Question, entry: Explored, trial: Trial, goal: float, compiled: dict) -> list:
+def _try_float32(task: SearchTask, entry: Exploration, trial: Trial, goal: float, compiled: dict) -> list:
     """The same method in float32, as fine as it must be there, if it keeps the error and there is time to compile it."""
-    wide = entry.contender
+    wide = entry.compiled_run
     if wide.adaptive and trial.fineness * float(np.finfo(np.float32).eps) > 1:
         return []  # a tolerance below rounding: steps would shrink without end
     if wide.name not in compiled:
-        if 1.5 * wide.compile_seconds > question.left():
+        if 1.5 * wide.compile_seconds > task.time_left():
             return []
-        compiled[wide.name] = contender(question.problem, wide.method, np.float32, push=question.push)
+        compiled[wide.name] = compile_run(task.problem, wide.method, np.float32, push=task.push)
     narrow = compiled[wide.name]
     for factor in (1.0, 1.25):
-        found = tried(question, narrow, trial.fineness * factor)
+        found = run_trial(task, narrow, trial.fineness * factor)
         if found.error <= goal:
             return [(narrow, found)]
     return []
 
 
-def _answer(
-    question: Question, found: list[Explored], kept: list, wanted: float, doubt: float, untried: tuple[str, ...]
+def _build_recommendation(
+    task: SearchTask, found: list[Exploration], kept: list, wanted: float, truth_error: float, untried: tuple[str, ...]
 ) -> Recommendation:
     """The fastest of what keeps the error, by times taken in turn, with the reason; or what stops it."""
-    problem = question.problem
-    seconds = timed_in_turn(kept)
+    problem = task.problem
+    seconds = time_in_turn(kept)
     ranked = sorted(range(len(kept)), key=lambda i: seconds[i])
-    choices = tuple(_choice(*kept[i], seconds[i]) for i in ranked)
-    reason = _why(choices, kept[ranked[0]][0], found) if kept else _obstacle(question, found, wanted, doubt)
+    choices = tuple(_build_choice(*kept[i], seconds[i]) for i in ranked)
+    reason = (
+        _explain_choice(choices, kept[ranked[0]][0], found)
+        if kept
+        else _explain_failure(task, found, wanted, truth_error)
+    )
     return Recommendation(
         scene=problem.scene,
         error=wanted,
         horizon=problem.duration,
         frames=problem.frames,
-        norm=question.norm.name + (" and its gradient" if question.push is not None else ""),
+        norm=task.norm.name + (" and its gradient" if task.push is not None else ""),
         best=choices[0] if choices else None,
         runners_up=choices[1:],
         reason=reason,
-        truth=question.truth.source,
-        doubt=doubt,
-        richardson=second_opinion(question, *kept[ranked[0]]) if kept else float("nan"),
+        truth=task.truth.source,
+        truth_error=truth_error,
+        richardson=estimate_richardson_error(task, *kept[ranked[0]]) if kept else float("nan"),
         untried=untried,
     )
 
 
-def _choice(entry: Contender, trial: Trial, seconds: float) -> Choice:
+def _build_choice(entry: CompiledRun, trial: Trial, seconds: float) -> Choice:
     return Choice(
         name=entry.name,
-        method=entry.tuned(trial.fineness),
+        method=entry.tune_method(trial.fineness),
         dtype=entry.dtype,
         dt=entry.dt(trial.fineness),
         steps_per_frame=entry.count(trial.fineness),
@@ -328,44 +344,42 @@ def _choice(entry: Contender, trial: Trial, seconds: float) -> Choice:
     )
 
 
-def _why(choices: tuple[Choice, ...], winner: Contender, found: list[Explored]) -> str:
+def _explain_choice(choices: tuple[Choice, ...], winner: CompiledRun, found: list[Exploration]) -> str:
     """One sentence: the choice, the longest step that holds, and who comes next."""
     best, *others = choices
-    holds = next(entry.holds for entry in found if entry.contender.name == winner.name)
-    told = [f"steps up to {seconds_text(holds)} hold"] if np.isfinite(holds) else []
+    longest_stable_step = next(entry.longest_stable_step for entry in found if entry.compiled_run.name == winner.name)
+    remarks = [f"steps up to {format_seconds(longest_stable_step)} hold"] if np.isfinite(longest_stable_step) else []
     other = next((c for c in others if c.name != best.name), None)
     if other is not None:
-        told.append(f"{other.name} takes {other.seconds / best.seconds:.1f} times as long at this error")
+        remarks.append(f"{other.name} takes {other.seconds / best.seconds:.1f} times as long at this error")
     else:
-        told.append("no other method came near in time")
-    return f"{best.name} at {best.step} in {best.dtype}: {', '.join(told)}."
+        remarks.append("no other method came near in time")
+    return f"{best.name} at {best.step} in {best.dtype}: {', '.join(remarks)}."
 
 
-def _obstacle(question: Question, found: list[Explored], wanted: float, doubt: float) -> str:
+def _explain_failure(task: SearchTask, found: list[Exploration], wanted: float, truth_error: float) -> str:
     """Why nothing keeps an error."""
-    scene, truth = question.problem.scene, question.truth
-    horizon = truth.horizon(wanted, 10 * float(np.finfo(float).eps), question.norm, question.scale)
+    scene, truth = task.problem.scene, task.truth
+    horizon = truth.horizon(wanted, 10 * float(np.finfo(float).eps), task.norm, task.scale)
     least = min((t.error for entry in found for t in entry.trials), default=np.inf)
     if np.isfinite(horizon):
-        grown = float(truth.growth(question.norm, question.scale).max())
-        what = "Chaos" if grown > CHAOTIC else "Rounding"
-        return (
-            f"{what}: beyond {seconds_text(horizon)} rounding alone has grown to an error of {wanted:g}; no method can."
-        )
-    if doubt > KNOWN * wanted:
-        cause = "springs that break" if scene.remembers else "touches answered at the end of a step"
+        grown = float(truth.growth(task.norm, task.scale).max())
+        what = "Chaos" if grown > CHAOTIC_GROWTH else "Rounding"
+        return f"{what}: beyond {format_seconds(horizon)} rounding alone has grown to an error of {wanted:g}; no method can."
+    if truth_error > TRUTH_ERROR_SHARE * wanted:
+        cause = "springs that break" if scene.has_memory else "touches answered at the end of a step"
         why = f" ({cause} leave every method at first order)" if scene.resolves_at_step_end else ""
-        unit, kind = truth.least_known(question.norm, question.scale), "scene" if scene.couples else "lane"
+        unit, kind = truth.find_least_certain(task.norm, task.scale), "scene" if scene.couples else "lane"
         where = "" if unit is None else f", worst in {kind} {unit}"
-        return f"The true path itself is known only to {doubt:.1e}{where}{why}; {wanted:g} cannot be promised."
-    if least <= SURE["float64"] * wanted - doubt:
+        return f"The true path itself is known only to {truth_error:.1e}{where}{why}; {wanted:g} cannot be promised."
+    if least <= SAFE_ERROR_SHARE["float64"] * wanted - truth_error:
         what = (
             "no time was left to compile it in float32"
-            if _worth_float32(question, wanted)
+            if _is_float32_accurate(task, wanted)
             else "float32 rounds too much"
         )
         return f"In float64 an error of {wanted:g} is kept, but {what}. Allow float64 by dtypes."
-    ended = "of the search" if question.left() < 0 else f"a run may take ({LONG:g} s)"
+    ended = "of the search" if task.time_left() < 0 else f"a run may take ({MAX_RUN_SECONDS:g} s)"
     if not np.isfinite(least):
         return f"No run held in the time {ended}. Give it more seconds, or fewer lanes: a few tell the error of many."
     return f"No method came below {least:.1e} in the time {ended}; {wanted:g} was asked for."

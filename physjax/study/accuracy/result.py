@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from physjax.files import replacing
-from physjax.show.style import PROJECTED
-from physjax.text import seconds_text, table
+from physjax.files import write_atomically
+from physjax.show.style import PROJECTED_SUFFIX
+from physjax.text import format_seconds, format_table
 
-ERRORS = (1e-2, 1e-4, 1e-6)
+TABLE_ERRORS = (1e-2, 1e-4, 1e-6)
 """Errors (relative to the extent of the path) for which the fastest method is named."""
 
 
-EXACT = 1e-10
+MAX_EXACT_FLOOR = 1e-10
 """A truth whose own error is larger than this cannot say of a run that it is exact."""
 
 
@@ -99,10 +99,10 @@ class WorkPrecision(NamedTuple):
         step it happens to fall. The truth's own error counts as rounding, but tells of no run that it is exact.
         """
         runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
-        resolved = [run for run in runs if self._rounding(run) < run.path_error < 0.05]
-        if runs and all(run.path_error <= self._rounding(run) for run in runs):
-            return float("inf") if self.floor <= EXACT else float("nan")
-        scattered = self.scattered or method.endswith(PROJECTED)
+        resolved = [run for run in runs if self._rounding_error(run) < run.path_error < 0.05]
+        if runs and all(run.path_error <= self._rounding_error(run) for run in runs):
+            return float("inf") if self.floor <= MAX_EXACT_FLOOR else float("nan")
+        scattered = self.scattered or method.endswith(PROJECTED_SUFFIX)
         finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt or scattered]
         errors = [run.path_error for run in finest]
         # what scatters says nothing unless it falls by much
@@ -112,7 +112,7 @@ class WorkPrecision(NamedTuple):
 
     def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
         """The run with the least time whose path error stays below `error`; None if none does."""
-        return _cheapest([run for run in self.runs if rivals or run.tolerance is None], error)
+        return _find_cheapest([run for run in self.runs if rivals or run.tolerance is None], error)
 
     @property
     def front(self) -> tuple[Run, ...]:
@@ -124,29 +124,29 @@ class WorkPrecision(NamedTuple):
         return tuple(front)
 
     def table(self) -> str:
-        """A line for each method: order promised and seen, its least time to each of `ERRORS`, and where it failed."""
-        headers = ["method", "order", "seen", *(f"to {e:.0e}" for e in ERRORS), "fails at dt", "compile"]
+        """A line for each method: order promised and seen, its least time to each of `TABLE_ERRORS`, and where it failed."""
+        headers = ["method", "order", "seen", *(f"to {e:.0e}" for e in TABLE_ERRORS), "fails at dt", "compile"]
         rows = []
         for method in self.methods:
             runs = self.of(method)
-            cheapest = [_cheapest(runs, error) for error in ERRORS]
+            cheapest = [_find_cheapest(runs, error) for error in TABLE_ERRORS]
             failed = [run.dt for run in runs if run.dt is not None and run.status != "ok"]
             rows.append(
                 [
                     method,
-                    _number(self.promised.get(method), ".0f"),
-                    _order(self.observed_order(method)) if method in self.promised else "-",
-                    *(seconds_text(run.seconds) if run else "-" for run in cheapest),
-                    seconds_text(min(failed)) if failed else "-",
-                    seconds_text(runs[0].compile_seconds),
+                    _format_number(self.promised.get(method), ".0f"),
+                    _format_order(self.observed_order(method)) if method in self.promised else "-",
+                    *(format_seconds(run.seconds) if run else "-" for run in cheapest),
+                    format_seconds(min(failed)) if failed else "-",
+                    format_seconds(runs[0].compile_seconds),
                 ]
             )
-        return table(headers, rows)
+        return format_table(headers, rows)
 
     def to_csv(self, path: str | os.PathLike) -> None:
         """Write every run as one line of a CSV file; whole or absent."""
         fields = [name for name in Run._fields if name not in ("drifts", "errors")]
-        with replacing(path) as file:
+        with write_atomically(path) as file:
             writer = csv.writer(file)
             writer.writerow(
                 [
@@ -169,18 +169,18 @@ class WorkPrecision(NamedTuple):
 
         return draw_work_precision(self, figure)
 
-    def _rounding(self, run: Run) -> float:
+    def _rounding_error(self, run: Run) -> float:
         """Errors below this are rounding, or the truth's own."""
         return max(10 * self.floor, 100 * float(np.finfo(run.dtype).eps) * math.sqrt(run.steps))
 
 
-def _cheapest(runs: Sequence[Run], error: float) -> Run | None:
+def _find_cheapest(runs: Sequence[Run], error: float) -> Run | None:
     return min((run for run in runs if run.path_error <= error), key=lambda run: run.seconds, default=None)
 
 
-def _order(order: float) -> str:
-    return "exact" if math.isinf(order) else _number(order, ".2f")
+def _format_order(order: float) -> str:
+    return "exact" if math.isinf(order) else _format_number(order, ".2f")
 
 
-def _number(value: float | None, spec: str) -> str:
+def _format_number(value: float | None, spec: str) -> str:
     return "-" if value is None or math.isnan(value) else format(value, spec)

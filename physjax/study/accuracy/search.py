@@ -7,51 +7,51 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from physjax.study.accuracy.error_measures import Norm, path
-from physjax.study.accuracy.method_facts import Contender
-from physjax.study.accuracy.reference_solution import Yardstick
+from physjax.study.accuracy.error_measures import ErrorMeasure, path
+from physjax.study.accuracy.method_facts import CompiledRun
+from physjax.study.accuracy.reference_solution import ReferenceSolution
 from physjax.study.problem import Problem
 
-REFINE, TIGHTEN = 2.0, 10.0
+STEPS_FACTOR, TOLERANCE_FACTOR = 2.0, 10.0
 """From one exploring run to the next: so many times the steps, so many times less tolerance."""
-SHORT, LONG = 20e-3, 2.0
+MIN_TIMED_SECONDS, MAX_RUN_SECONDS = 20e-3, 2.0
 """Runs are timed again up to this [s] together, since clocks and neighbours blur short ones; one above ends an exploration."""
-FINEST = 1e12
+MAX_FINENESS = 1e12
 """Of tolerances; below is rounding."""
-NEAR = 1.15
+CLOSE_STEP_RATIO = 1.15
 """A step within this factor of the longest that would do is as good."""
-ROUNDS, PATIENCE = 7, 0.3
+MIN_TIMING_ROUNDS, MIN_TIMING_SECONDS = 7, 0.3
 """Turns that finalists take at least, and for how long [s]: what disturbs the machine comes in bursts."""
-GRACE = 5.0
+GRACE_SECONDS = 5.0
 """Beyond the deadline nothing is compiled; short runs may still settle an answer for so long [s]."""
 
 
-class Question(NamedTuple):
+class SearchTask(NamedTuple):
     """What is asked of a run, and until when (`time.process_time`) there is time to answer it."""
 
     problem: Problem
-    truth: Yardstick
-    norm: Norm
+    truth: ReferenceSolution
+    norm: ErrorMeasure
     scale: Any
     push: Any
     deadline: float
 
-    def left(self) -> float:
+    def time_left(self) -> float:
         """Processor time left [s]."""
         return self.deadline - time.process_time()
 
     def error(self, found: Any) -> float:
         """The error of a run; of what becomes of the push as well, if there is one."""
         if self.push is None:
-            return self._of(self.norm, found, self.truth.states, self.scale)
+            return self._finite_error(self.norm, found, self.truth.states, self.scale)
         states, slopes = found
         largest = float(np.abs(np.asarray(self.truth.slopes.place)).max())
         return max(
-            self._of(self.norm, states, self.truth.states, self.scale),
-            self._of(path, slopes, self.truth.slopes, largest),
+            self._finite_error(self.norm, states, self.truth.states, self.scale),
+            self._finite_error(path, slopes, self.truth.slopes, largest),
         )
 
-    def _of(self, norm: Norm, states: Any, truth: Any, scale: Any) -> float:
+    def _finite_error(self, norm: ErrorMeasure, states: Any, truth: Any, scale: Any) -> float:
         error = norm.error(self.truth.scene, self.truth.times, states, truth, self.truth.size(norm, scale))
         return error if np.isfinite(error) else float("inf")
 
@@ -64,17 +64,17 @@ class Trial(NamedTuple):
     seconds: float
 
 
-class Explored(NamedTuple):
+class Exploration(NamedTuple):
     """A method and its runs, from coarse to fine."""
 
-    contender: Contender
+    compiled_run: CompiledRun
     trials: tuple[Trial, ...]
 
     @property
     def slope(self) -> float:
         """The power of fineness with which errors fall, as seen in the last two runs that are far from rounding."""
-        order = self.contender.promised if np.isfinite(self.contender.promised) else 1.0
-        promised = order / (order + 1) if self.contender.adaptive else order
+        order = self.compiled_run.promised if np.isfinite(self.compiled_run.promised) else 1.0
+        promised = order / (order + 1) if self.compiled_run.adaptive else order
         good = [t for t in self.trials if 1e-13 < t.error < 0.3]
         if len(good) < 2 or good[-1].error >= good[-2].error:
             return promised
@@ -104,69 +104,69 @@ class Explored(NamedTuple):
         if not np.isfinite(fineness):
             return np.inf
         nearest = min(self.trials, key=lambda t: abs(np.log(t.fineness / fineness)))
-        order = self.contender.promised if np.isfinite(self.contender.promised) else 1.0
-        power = 1 / (order + 1) if self.contender.adaptive else 1.0
+        order = self.compiled_run.promised if np.isfinite(self.compiled_run.promised) else 1.0
+        power = 1 / (order + 1) if self.compiled_run.adaptive else 1.0
         return nearest.seconds * (fineness / nearest.fineness) ** (
             power if fineness > nearest.fineness else 0.5 * power
         )
 
     @property
-    def holds(self) -> float:
+    def longest_stable_step(self) -> float:
         """The longest step [s] that held, where longer ones were tried and did not; infinite if none failed."""
         failed = [t.fineness for t in self.trials if not t.error < 1]
         held = [t.fineness for t in self.trials if t.error < 1 and t.fineness > max(failed, default=0.0)]
-        return self.contender.dt(min(held)) if failed and held and not self.contender.adaptive else float("inf")
+        return self.compiled_run.dt(min(held)) if failed and held and not self.compiled_run.adaptive else float("inf")
 
 
-def tried(question: Question, entry: Contender, fineness: float) -> Trial:
+def run_trial(task: SearchTask, entry: CompiledRun, fineness: float) -> Trial:
     """Run a method once, and again where that was short."""
     times = []
-    while not times or (len(times) < 16 and sum(times) < SHORT):
+    while not times or (len(times) < 16 and sum(times) < MIN_TIMED_SECONDS):
         started = time.perf_counter()
         found = jax.block_until_ready(entry(fineness))
         times.append(time.perf_counter() - started)
     exactly = fineness if entry.adaptive else float(entry.count(fineness))
-    return Trial(exactly, question.error(jax.tree.map(np.asarray, found)), min(times))
+    return Trial(exactly, task.error(jax.tree.map(np.asarray, found)), min(times))
 
 
-def explored(
-    question: Question,
-    entry: Contender,
+def explore_method(
+    task: SearchTask,
+    entry: CompiledRun,
     least: float,
-    others: Sequence[Explored],
+    others: Sequence[Exploration],
     start: float,
-    longest: float = LONG,
-) -> Explored:
+    longest: float = MAX_RUN_SECONDS,
+) -> Exploration:
     """Runs of a method from coarse to fine, until the least error is met, rounding stops it, or others are faster.
 
     A run that takes `longest` [s] is the last.
     """
-    factor, fineness, trials = (TIGHTEN, 10.0, []) if entry.adaptive else (REFINE, start, [])
-    while fineness <= FINEST and (not trials or question.left() > -GRACE):
-        trials.append(tried(question, entry, fineness))
+    factor, fineness, trials = (TOLERANCE_FACTOR, 10.0, []) if entry.adaptive else (STEPS_FACTOR, start, [])
+    while fineness <= MAX_FINENESS and (not trials or task.time_left() > -GRACE_SECONDS):
+        trials.append(run_trial(task, entry, fineness))
         now = trials[-1]
-        if now.error <= 0.5 * least or now.seconds > longest or _stuck(trials):
+        if now.error <= 0.5 * least or now.seconds > longest or _has_stalled(trials):
             break
         # where steps follow the state, loose tolerances say nothing of tight ones
-        if not entry.adaptive and _beaten(now, others):
+        if not entry.adaptive and _is_outperformed(now, others):
             break
         fineness *= factor
-    return Explored(entry, tuple(trials))
+    return Exploration(entry, tuple(trials))
 
 
-def _stuck(trials: Sequence[Trial]) -> bool:
+def _has_stalled(trials: Sequence[Trial]) -> bool:
     """Whether three more runs brought nothing: rounding, or a truth that is another one."""
     if len(trials) < 5 or not trials[-4].error < 0.5:
         return False
     return min(t.error for t in trials[-3:]) > 0.7 * trials[-4].error
 
 
-def _beaten(now: Trial, others: Sequence[Explored]) -> bool:
+def _is_outperformed(now: Trial, others: Sequence[Exploration]) -> bool:
     """Whether another method has an error as small in a fifth of the time."""
     return any(t.error <= now.error and t.seconds < 0.2 * now.seconds for other in others for t in other.trials)
 
 
-def refined(question: Question, entry: Explored, goal: float, most: float) -> tuple[Explored, Trial | None]:
+def refine_step(task: SearchTask, entry: Exploration, goal: float, most: float) -> tuple[Exploration, Trial | None]:
     """The longest step that keeps an error, verified: the runs with those made here, and that run; None if none keeps it.
 
     `most` [s] is what a run may take to be of interest.
@@ -175,27 +175,29 @@ def refined(question: Question, entry: Explored, goal: float, most: float) -> tu
         good = [t for t in entry.trials if t.error <= goal]
         best = min(good, key=lambda t: t.fineness, default=None)
         guess = entry.fineness(goal)
-        if not entry.contender.adaptive:
+        if not entry.compiled_run.adaptive:
             guess = float(max(1, round(guess))) if np.isfinite(guess) else guess
         if not np.isfinite(guess):
             return entry, None
         known = any(abs(np.log(t.fineness / guess)) < 1e-9 for t in entry.trials)
-        if best is not None and (known or best.fineness / guess < NEAR or question.left() < -GRACE):
+        if best is not None and (
+            known or best.fineness / guess < CLOSE_STEP_RATIO or task.time_left() < -GRACE_SECONDS
+        ):
             return entry, best
         if known:  # the guess itself failed, and nothing finer is known: a little finer
-            guess *= NEAR
-        if entry.seconds(guess) > most or question.left() < -GRACE:
+            guess *= CLOSE_STEP_RATIO
+        if entry.seconds(guess) > most or task.time_left() < -GRACE_SECONDS:
             return entry, None
-        trials = sorted((*entry.trials, tried(question, entry.contender, guess)))
+        trials = sorted((*entry.trials, run_trial(task, entry.compiled_run, guess)))
         entry = entry._replace(trials=tuple(trials))
     return entry, min((t for t in entry.trials if t.error <= goal), key=lambda t: t.fineness, default=None)
 
 
-def timed_in_turn(finalists: Sequence[tuple[Contender, Trial]]) -> list[float]:
+def time_in_turn(finalists: Sequence[tuple[CompiledRun, Trial]]) -> list[float]:
     """The least time of each finalist's run [s], all taking turns, so that whatever else the machine does meets all."""
     least = [trial.seconds for _, trial in finalists]
     begun, rounds = time.perf_counter(), 0
-    while finalists and (rounds < ROUNDS or time.perf_counter() - begun < PATIENCE):
+    while finalists and (rounds < MIN_TIMING_ROUNDS or time.perf_counter() - begun < MIN_TIMING_SECONDS):
         rounds += 1
         for i, (entry, trial) in enumerate(finalists):
             started = time.perf_counter()
@@ -204,12 +206,12 @@ def timed_in_turn(finalists: Sequence[tuple[Contender, Trial]]) -> list[float]:
     return least
 
 
-def second_opinion(question: Question, entry: Contender, trial: Trial) -> float:
+def estimate_richardson_error(task: SearchTask, entry: CompiledRun, trial: Trial) -> float:
     """Richardson's word on the error of a run: how much half the step (a tenth of the tolerance) changes it."""
     order = entry.promised if np.isfinite(entry.promised) else 1.0
-    factor = TIGHTEN ** (1 + 1 / order) if entry.adaptive else REFINE
+    factor = TOLERANCE_FACTOR ** (1 + 1 / order) if entry.adaptive else STEPS_FACTOR
     here, finer = (jax.tree.map(np.asarray, entry(f)) for f in (trial.fineness, trial.fineness * factor))
-    here, finer = ((found if question.push is None else found[0]) for found in (here, finer))
-    size = question.truth.size(question.norm, question.scale)
-    change = question.norm.error(question.truth.scene, question.truth.times, here, finer, size)
+    here, finer = ((found if task.push is None else found[0]) for found in (here, finer))
+    size = task.truth.size(task.norm, task.scale)
+    change = task.norm.error(task.truth.scene, task.truth.times, here, finer, size)
     return change / (1 - 2.0**-order)

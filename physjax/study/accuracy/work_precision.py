@@ -11,28 +11,28 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.methods import METHODS
-from physjax.stepping.reference import default_solver, in_dtype
-from physjax.study.accuracy.error_measures import Norm, as_norm
-from physjax.study.accuracy.method_facts import depends_on_velocity, promised_order, random_push, title_of
-from physjax.study.accuracy.reference_solution import Yardstick, yardstick
+from physjax.stepping.reference import build_default_solver, cast_floats
+from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure
+from physjax.study.accuracy.method_facts import depends_on_velocity, draw_random_push, method_title, promised_order
+from physjax.study.accuracy.reference_solution import ReferenceSolution, solve_reference
 from physjax.study.accuracy.result import WorkPrecision
-from physjax.study.accuracy.runs import Budget, Contest, gradient_runs, method_runs, rival_runs, treatments
+from physjax.study.accuracy.runs import Budget, Comparison, list_treatments, run_gradient, run_method, run_rival
 from physjax.study.energy.quantities import Conserved
 from physjax.study.problem import Problem
 
 TOLERANCES = tuple(10.0**-k for k in range(2, 13))
 """Tolerances at which what chooses its own steps runs."""
 
-DETAIL = 12
+REFERENCE_FRAMES_PER_FRAME = 12
 """Moments of the reference path for every one at which errors are measured."""
 
-EXACTLY = 2.5e-11
+REFERENCE_ERROR = 2.5e-11
 """Error for which our own rk4 is made fine enough where it must be the truth: its last refinement is then below 1e-12."""
 
-LOST = 1e-2
+HORIZON_ERROR_SHARE = 1e-2
 """Rounding that has grown to this part of the path leaves no meaning to errors from point to point."""
 
 THOROUGH = Budget()
@@ -49,7 +49,7 @@ def work_precision(
     duration: float | None = None,
     exact: Callable | None = None,
     conserved: Sequence[Conserved] = (),
-    norms: Sequence[Norm | Callable] = (),
+    norms: Sequence[ErrorMeasure | Callable] = (),
     rivals: Sequence[Any] | None = None,
     tolerances: Sequence[float] = TOLERANCES,
     dtype: Any = np.float64,
@@ -83,51 +83,53 @@ def work_precision(
     """
     problem = _as_problem(problem, duration, exact, conserved)
     methods = list(METHODS.values()) if methods is None else list(methods)
-    rivals = _checked_rivals(problem, rivals)
+    rivals = _check_rivals(problem, rivals)
     if dts is not None:
-        dts = np.atleast_1d(np.asarray(real_quantity("dts [s]", dts, above=0.0), float))
+        dts = np.atleast_1d(np.asarray(as_real_quantity("dts [s]", dts, above=0.0), float))
     dtypes = [np.dtype(d) for d in (dtype if isinstance(dtype, list | tuple) else (dtype,))]
-    batch, norms = positive_integer("batch", batch), tuple(as_norm(norm) for norm in norms)
+    batch, norms = as_positive_integer("batch", batch), tuple(as_error_measure(norm) for norm in norms)
     with jax.enable_x64(True):
         progress("reference")
-        push = random_push(problem.scene) if gradient else None
-        detailed = yardstick(problem._replace(frames=problem.frames * DETAIL), wanted=EXACTLY, push=push)
-        contest = Contest(problem, _at_frames(detailed), norms, budget, dts, tolerances, batch)
+        push = draw_random_push(problem.scene) if gradient else None
+        detailed = solve_reference(
+            problem._replace(frames=problem.frames * REFERENCE_FRAMES_PER_FRAME), wanted=REFERENCE_ERROR, push=push
+        )
+        contest = Comparison(problem, _pick_frames(detailed), norms, budget, dts, tolerances, batch)
         runs, slopes, promised = [], [], {}
         pulled = depends_on_velocity(problem.scene)
         for method in methods:
-            progress(title_of(method))
-            for suffix, treated in treatments(problem.scene).items():
+            progress(method_title(method))
+            for suffix, treated in list_treatments(problem.scene).items():
                 for kind in dtypes:
-                    runs += method_runs(contest, treated, method, suffix, kind)
+                    runs += run_method(contest, treated, method, suffix, kind)
                     promised[runs[-1].method] = promised_order(method, pulled, treated)
-                slopes += gradient_runs(contest, treated, method, suffix, push) if gradient else []
+                slopes += run_gradient(contest, treated, method, suffix, push) if gradient else []
         for solver in rivals:
             progress(f"diffrax {type(solver).__name__}")
-            runs += rival_runs(contest, in_dtype(problem.scene, dtypes[0]), solver)
+            runs += run_rival(contest, cast_floats(problem.scene, dtypes[0]), solver)
     return WorkPrecision(
         name=name,
         runs=tuple(runs),
         promised=promised,
         truth=detailed.source,
-        floor=float(detailed.doubt().max()),
+        floor=float(detailed.truth_error().max()),
         duration=problem.duration,
         conserved=tuple(quantity.name for quantity in problem.conserved),
         dtype=" and ".join(kind.name for kind in dtypes),
         path=(detailed.times, detailed.states.position),
         scattered=problem.scene.resolves_at_step_end,
         norms=tuple(norm.name for norm in norms),
-        horizon=detailed.horizon(LOST, float(np.finfo(dtypes[0]).eps)),
+        horizon=detailed.horizon(HORIZON_ERROR_SHARE, float(np.finfo(dtypes[0]).eps)),
         batch=batch,
         gradients=tuple(slopes),
     )
 
 
-def _at_frames(detailed: Yardstick) -> Yardstick:
+def _pick_frames(detailed: ReferenceSolution) -> ReferenceSolution:
     """The truth at the moments at which errors are measured."""
-    fewer = lambda tree: jax.tree.map(lambda leaf: leaf[::DETAIL], tree)  # noqa: E731
+    fewer = lambda tree: jax.tree.map(lambda leaf: leaf[::REFERENCE_FRAMES_PER_FRAME], tree)  # noqa: E731
     parts = {name: fewer(getattr(detailed, name)) for name in ("states", "second", "nudged", "slopes")}
-    return detailed._replace(times=detailed.times[::DETAIL], **parts)
+    return detailed._replace(times=detailed.times[::REFERENCE_FRAMES_PER_FRAME], **parts)
 
 
 def _as_problem(problem, duration, exact, conserved):
@@ -139,11 +141,11 @@ def _as_problem(problem, duration, exact, conserved):
         )
     if duration is None:
         raise ValueError("work_precision: got a scene without a duration, expected duration= [s].")
-    real_quantity("duration [s]", duration, above=0.0)
+    as_real_quantity("duration [s]", duration, above=0.0)
     return Problem(problem, float(duration), exact, tuple(conserved))
 
 
-def _checked_rivals(problem, rivals):
+def _check_rivals(problem, rivals):
     if rivals is None:
         return default_rivals() if problem.is_ode else ()
     if rivals and not problem.is_ode:
@@ -163,4 +165,4 @@ def default_rivals() -> tuple:
     """
     import diffrax
 
-    return diffrax.Tsit5(), default_solver()
+    return diffrax.Tsit5(), build_default_solver()

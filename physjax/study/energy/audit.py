@@ -16,68 +16,72 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.loops import Moment, Time, moment_at, now
+from physjax.loops import Moment, Time, moment_at, to_float_time
 from physjax.parts import force_name
-from physjax.physics.contacts.time_of_impact import Flight, flights, impact
-from physjax.physics.rigid.response import collide, collisions
+from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
+from physjax.physics.rigid.response import collide, fold_body_flights
 from physjax.scene import Scene, free_motion, project
-from physjax.stepping.reference import default_solver, in_dtype
+from physjax.stepping.reference import build_default_solver, cast_floats
 from physjax.study import energy
 from physjax.vectors import scale
 
 NUMERICAL, PINS, PIVOTS = "numerical", "pins", "pivots"
-LEGS = {impact: flights, collide: collisions}
+RESPONSE_OBSERVERS = {impact: fold_flights, collide: fold_body_flights}
 """How a response tells the legs of its steps. Particles have the one, bodies the other."""
-Books = dict[str, Any]
+EnergyBudget = dict[str, Any]
 """What each cause has brought so far: energy, momentum and, beyond one dimension, angular momentum, by its name."""
 
 
 @eqx.filter_jit
-def booked(run: Any, substeps: Array) -> tuple[Books, Books]:
+def audit_run(run: Any, substeps: Array) -> tuple[EnergyBudget, EnergyBudget]:
     """What the scene has in stock at each frame, and what each cause brings between a frame and the next; in float64.
 
     `substeps` of order 8 follow the exact motion through every step. For use inside `jax.enable_x64(True)`.
     """
-    audit = lambda run: _booked_run(run, substeps)  # noqa: E731
+    audit = lambda run: _audit_single_run(run, substeps)  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
         audit = jax.vmap(audit)
     return audit(run)
 
 
-def _booked_run(run: Any, substeps: Array) -> tuple[Books, Books]:
+def _audit_single_run(run: Any, substeps: Array) -> tuple[EnergyBudget, EnergyBudget]:
     scene, film = run.scene, run.film
     changes = jax.tree.map(lambda a, b: a.ndim < b.ndim, scene, film)
     frames, still = eqx.filter(film, changes), eqx.filter(scene, changes, inverse=True)
 
     def between(number, frame):
         def step(i, carry):
-            moving, books = carry
+            moving, budget = carry
             count = run.first_step + number * run.save_every + i
             t = moment_at(count, run.dt, scene.state.dtype)
-            after, books = _step(eqx.combine(moving, still), run.stepper, t, run.dt, substeps, books)
-            return eqx.filter(after, changes), books
+            after, budget = _audit_step(eqx.combine(moving, still), run.stepper, t, run.dt, substeps, budget)
+            return eqx.filter(after, changes), budget
 
-        return lax.fori_loop(0, run.save_every, step, (frame, nothing(scene)))[1]
+        return lax.fori_loop(0, run.save_every, step, (frame, build_empty_budget(scene)))[1]
 
     numbers = jnp.arange(len(run.time) - 1, dtype=jnp.int32)
     begins = jax.tree.map(lambda leaf: leaf[:-1], frames)
     brought = lax.map(lambda each: between(*each), (numbers, begins))
-    stock = lax.map(lambda each: _stock(each[0], in_float64(eqx.combine(each[1], still))), (run.time, frames))
+    stock = lax.map(
+        lambda each: _measure_stock(each[0], cast_to_float64(eqx.combine(each[1], still))), (run.time, frames)
+    )
     return stock, brought
 
 
-def causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
+def list_causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
     """Names of the forces, of the contacts, and of the rest: springs that part, what holds, and the method."""
     parting = [
-        f"{name} parted" for name, force in zip(named(scene.forces), scene.forces, strict=True) if _forgets(force)
+        f"{name} parted"
+        for name, force in zip(name_parts(scene.forces), scene.forces, strict=True)
+        if _may_lose_energy(force)
     ]
     holding = [PINS] if scene.pinned is not None else []
     holding += [PIVOTS] if getattr(scene.mass, "arm", None) is not None else []
-    contacts = named(scene.contacts)
-    return named(scene.forces), contacts, [*parting, *holding, NUMERICAL]
+    contacts = name_parts(scene.contacts)
+    return name_parts(scene.forces), contacts, [*parting, *holding, NUMERICAL]
 
 
-def named(parts: tuple) -> list[str]:
+def name_parts(parts: tuple) -> list[str]:
     """What forces or contacts are called, numbered where several are called the same."""
     names, seen = [force_name(part) for part in parts], Counter()
     several = {name for name, count in Counter(names).items() if count > 1}
@@ -87,25 +91,25 @@ def named(parts: tuple) -> list[str]:
     return names
 
 
-def _forgets(force: Any) -> bool:
+def _may_lose_energy(force: Any) -> bool:
     """Whether a force may lose energy between two steps: it remembers, and has a potential."""
     return hasattr(force, "advance") and hasattr(force, "potential")
 
 
-def in_float64(tree: Any) -> Any:
+def cast_to_float64(tree: Any) -> Any:
     """The arrays in float64."""
-    return in_dtype(tree, jnp.float64)
+    return cast_floats(tree, jnp.float64)
 
 
-def nothing(scene: Scene) -> Books:
+def build_empty_budget(scene: Scene) -> EnergyBudget:
     """Books without an entry."""
-    wide = in_float64(scene)
-    empty = jax.eval_shape(lambda scene: _amounts(scene, jnp.zeros(()), scene.state), wide)
+    wide = cast_to_float64(scene)
+    empty = jax.eval_shape(lambda scene: _measure_quantities(scene, jnp.zeros(()), scene.state), wide)
     zeros = lambda: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), empty)  # noqa: E731
-    return {name: zeros() for names in causes(scene) for name in names}
+    return {name: zeros() for names in list_causes(scene) for name in names}
 
 
-def _amounts(scene: Scene, t: ArrayLike, state: Any, measure: Callable = energy.total) -> dict[str, Array]:
+def _measure_quantities(scene: Scene, t: ArrayLike, state: Any, measure: Callable = energy.total) -> dict[str, Array]:
     """Energy [J], momentum [kg m/s] and angular momentum [kg m²/s] of a state."""
     found = {"energy": measure(scene, t, state), "momentum": energy.momentum(scene, t, state)}
     if state.position.shape[-1] > 1:
@@ -113,92 +117,103 @@ def _amounts(scene: Scene, t: ArrayLike, state: Any, measure: Callable = energy.
     return found
 
 
-def _stock(t: Array, scene: Scene) -> Books:
+def _measure_stock(t: Array, scene: Scene) -> EnergyBudget:
     """Kinetic energy, every force's potential energy, and both momenta with the sizes that they are measured by."""
     t, state = t.astype(jnp.float64), scene.state
     found = {"kinetic": energy.kinetic(scene, t, state)}
-    for name, force in zip(named(scene.forces), scene.forces, strict=True):
+    for name, force in zip(name_parts(scene.forces), scene.forces, strict=True):
         if hasattr(force, "potential"):
             found[f"potential of {name}"] = _potential(force, scene, t, state)
-    amounts = _amounts(scene, t, state)
+    amounts = _measure_quantities(scene, t, state)
     kinds = (energy.ENERGY, energy.MOMENTUM, energy.ANGULAR_MOMENTUM)
     sizes = {kind.name: kind.size(scene, t, state) for kind in kinds if kind.name in amounts}
     return {"stored": found, "amounts": amounts, "sizes": sizes}
 
 
 def _potential(force: Any, scene: Scene, t: ArrayLike, state: Any) -> Array:
-    return energy.summed(scene, force.potential(t, *state.shown_to(force, scene.mass)))
+    return energy.summed(scene, force.potential(t, *state.view_for_force(force, scene.mass)))
 
 
-def _in_float64(t: Moment) -> Array:
+def _cast_moment_to_float64(t: Moment) -> Array:
     """A moment as one number, which in float64 holds all of it."""
-    start, rest, elapsed = in_float64((t.start, t.rest, 0.0 if t.elapsed is None else t.elapsed))
+    start, rest, elapsed = cast_to_float64((t.start, t.rest, 0.0 if t.elapsed is None else t.elapsed))
     return start + (rest + elapsed)
 
 
-def _step(scene: Scene, method: Any, t: Time, dt: Array, substeps: Array, books: Books) -> tuple[Scene, Books]:
+def _audit_step(
+    scene: Scene, method: Any, t: Time, dt: Array, substeps: Array, budget: EnergyBudget
+) -> tuple[Scene, EnergyBudget]:
     """One step of the run, entered in the books: its motion, touches, what leads nodes, and what parts."""
     motion = partial(free_motion, method)
-    enter = partial(_entered, in_float64(scene), substeps)
+    enter = partial(_record_flight, cast_to_float64(scene), substeps)
     responses = {contact.response for contact in scene.contacts}
-    if responses & LEGS.keys():
-        books, moved = LEGS[(responses & LEGS.keys()).pop()](motion, scene, t, dt, enter, books)
+    if responses & RESPONSE_OBSERVERS.keys():
+        budget, moved = RESPONSE_OBSERVERS[(responses & RESPONSE_OBSERVERS.keys()).pop()](
+            motion, scene, t, dt, enter, budget
+        )
     else:
         moved = motion(scene, t, dt).state
-        books = enter(books, Flight(scene.state, scene, t, dt, moved, moved, None))
+        budget = enter(budget, Flight(scene.state, scene, t, dt, moved, moved, None))
     after = scene.step(method, t, dt)
-    end, wide = _in_float64(t + dt), in_float64(scene)
-    has = lambda state, at=wide: _amounts(at, end, in_float64(state))  # noqa: E731
+    end, wide = _cast_moment_to_float64(t + dt), cast_to_float64(scene)
+    has = lambda state, at=wide: _measure_quantities(at, end, cast_to_float64(state))  # noqa: E731
 
-    def change(books, name, before, now):
-        return {**books, name: _plus(books[name], _minus(now, before))}
+    def change(budget, name, before, now):
+        return {**budget, name: _add(budget[name], _subtract(now, before))}
 
-    if scene.led is not None:
-        led = scene.led.lead(now(t + dt), moved)
-        books, moved = change(books, NUMERICAL, has(moved), has(led)), led
-    for name, contact in zip(named(scene.contacts), scene.contacts, strict=True):
+    if scene.prescribed_motion is not None:
+        led = scene.prescribed_motion.prescribe(to_float_time(t + dt), moved)
+        budget, moved = change(budget, NUMERICAL, has(moved), has(led)), led
+    for name, contact in zip(name_parts(scene.contacts), scene.contacts, strict=True):
         if (contact.response or project) is project:
-            answered = contact.answered(now(t + dt), moved, scene.mass)
-            books, moved = change(books, name, has(moved), has(answered)), answered
+            answered = contact.resolve(to_float_time(t + dt), moved, scene.mass)
+            budget, moved = change(budget, name, has(moved), has(answered)), answered
     # held nodes that a contact moved are put back; without pins there is nothing left but rounding
-    books = change(books, PINS if scene.pinned is not None else NUMERICAL, has(moved), has(after.state))
-    for i, (name, force) in enumerate(zip(named(scene.forces), scene.forces, strict=True)):
-        if _forgets(force):
+    budget = change(budget, PINS if scene.pinned is not None else NUMERICAL, has(moved), has(after.state))
+    for i, (name, force) in enumerate(zip(name_parts(scene.forces), scene.forces, strict=True)):
+        if _may_lose_energy(force):
             forces = (*scene.forces[:i], after.forces[i], *scene.forces[i + 1 :])
-            books = change(
-                books, f"{name} parted", has(after.state), has(after.state, in_float64(scene.having(forces=forces)))
+            budget = change(
+                budget,
+                f"{name} parted",
+                has(after.state),
+                has(after.state, cast_to_float64(scene.replace(forces=forces))),
             )
-    return after, books
+    return after, budget
 
 
-def _entered(whole: Scene, substeps: Array, books: Books, flight: Flight) -> Books:
+def _record_flight(whole: Scene, substeps: Array, budget: EnergyBudget, flight: Flight) -> EnergyBudget:
     """The books after a flight: works and impulses along the exact motion, and what the method and the touch made of it."""
-    start, before, end, after = in_float64((flight.scene, flight.before, flight.end, flight.after))
-    t, duration = _in_float64(flight.begun), flight.duration.astype(jnp.float64)
-    has = lambda t, state: _amounts(whole, t, state)  # noqa: E731
-    exact, works, holding = _exact(whole, start, t, duration, substeps)
-    names, contacts, _ = causes(whole)
+    start, before, end, after = cast_to_float64((flight.scene, flight.before, flight.end, flight.after))
+    t, duration = _cast_moment_to_float64(flight.leg_start), flight.duration.astype(jnp.float64)
+    has = lambda t, state: _measure_quantities(whole, t, state)  # noqa: E731
+    exact, works, holding = _integrate_exactly(whole, start, t, duration, substeps)
+    names, contacts, _ = list_causes(whole)
     entries = dict(zip(names, works, strict=True))
-    entries[NUMERICAL] = _minus(has(t + duration, end), has(t + duration, exact))
-    timed = [contact.response in LEGS for contact in whole.contacts]
+    entries[NUMERICAL] = _subtract(has(t + duration, end), has(t + duration, exact))
+    timed = [contact.response in RESPONSE_OBSERVERS for contact in whole.contacts]
     if any(timed):
-        entries |= _shared(contacts, _nearest(whole, timed, t, before), _minus(has(t, start.state), has(t, before)))
-        touch = _minus(has(t + duration, after), has(t + duration, end))
-        entries = _sum(entries, _shared(contacts, _nearest(whole, timed, t + duration, end), touch))
-        lean = _nearest(whole, timed, t, start.state)
+        entries |= _split_by_contact(
+            contacts, _find_nearest_contact(whole, timed, t, before), _subtract(has(t, start.state), has(t, before))
+        )
+        touch = _subtract(has(t + duration, after), has(t + duration, end))
+        entries = _add_entries(
+            entries, _split_by_contact(contacts, _find_nearest_contact(whole, timed, t + duration, end), touch)
+        )
+        lean = _find_nearest_contact(whole, timed, t, start.state)
         if whole.held is not None:
             held = jnp.ones(whole.status_shape, bool) if whole.couples else whole.held
-            entries[PINS] = _where(held, holding)
+            entries[PINS] = _mask_amounts(held, holding)
             lean = [share & ~held for share in lean]
-        entries = _sum(entries, _shared(contacts, lean, holding))
-    elif PINS in books or PIVOTS in books:
-        entries[PINS if PINS in books else PIVOTS] = holding
-    if flight.flying is not None:
-        entries = {name: _where(flight.flying, entry) for name, entry in entries.items()}
-    return _sum(books, entries)
+        entries = _add_entries(entries, _split_by_contact(contacts, lean, holding))
+    elif PINS in budget or PIVOTS in budget:
+        entries[PINS if PINS in budget else PIVOTS] = holding
+    if flight.active is not None:
+        entries = {name: _mask_amounts(flight.active, entry) for name, entry in entries.items()}
+    return _add_entries(budget, entries)
 
 
-def _nearest(scene: Scene, timed: list[bool], t: Array, state: Any) -> list[Array]:
+def _find_nearest_contact(scene: Scene, timed: list[bool], t: Array, state: Any) -> list[Array]:
     """For each contact, whether it is the nearest of those that time their impacts; of coupled lanes, to any of them."""
 
     def gap(contact):
@@ -211,43 +226,43 @@ def _nearest(scene: Scene, timed: list[bool], t: Array, state: Any) -> list[Arra
     return [nearest == i for i in range(len(gaps))]
 
 
-def _shared(names: list[str], shares: list[Array], amounts: dict) -> Books:
-    return {name: _where(share, amounts) for name, share in zip(names, shares, strict=True)}
+def _split_by_contact(names: list[str], shares: list[Array], amounts: dict) -> EnergyBudget:
+    return {name: _mask_amounts(share, amounts) for name, share in zip(names, shares, strict=True)}
 
 
-def _where(flag: Array, amounts: Any) -> Any:
+def _mask_amounts(flag: Array, amounts: Any) -> Any:
     return jax.tree.map(lambda a: jnp.where(flag.reshape(flag.shape + (1,) * (a.ndim - flag.ndim)), a, 0.0), amounts)
 
 
-def _plus(a: Any, b: Any) -> Any:
+def _add(a: Any, b: Any) -> Any:
     return jax.tree.map(jnp.add, a, b)
 
 
-def _minus(a: Any, b: Any) -> Any:
+def _subtract(a: Any, b: Any) -> Any:
     return jax.tree.map(jnp.subtract, a, b)
 
 
-def _sum(books: Books, entries: Books) -> Books:
+def _add_entries(budget: EnergyBudget, entries: EnergyBudget) -> EnergyBudget:
     """The books with the entries added to those of the same name."""
-    return books | {name: _plus(books[name], entry) if name in books else entry for name, entry in entries.items()}
+    return budget | {name: _add(budget[name], entry) if name in budget else entry for name, entry in entries.items()}
 
 
-def _exact(whole: Scene, start: Scene, t: Array, duration: Array, substeps: Array) -> tuple[Any, list, Any]:
+def _integrate_exactly(whole: Scene, start: Scene, t: Array, duration: Array, substeps: Array) -> tuple[Any, list, Any]:
     """The exact motion: its end, what every force brings along it, and what is brought by what holds the scene."""
     import diffrax
 
-    scene = start.during(t, duration)
+    scene = start.averaged_over_step(t, duration)
 
     def slope(share, y, _):
         now, (state, _, _) = t + share * duration, y
-        rate, works, holding = _rates(whole, scene, now, state)
+        rate, works, holding = _compute_rates(whole, scene, now, state)
         return jax.tree.map(partial(scale, duration), (rate, works, holding))
 
-    empty = jax.eval_shape(lambda: _rates(whole, scene, t, scene.state)[1:])
+    empty = jax.eval_shape(lambda: _compute_rates(whole, scene, t, scene.state)[1:])
     zeros = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), empty)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(slope),
-        default_solver(),
+        build_default_solver(),
         t0=jnp.zeros(()),
         t1=jnp.ones(()),
         dt0=1 / substeps.astype(jnp.float64),
@@ -260,15 +275,15 @@ def _exact(whole: Scene, start: Scene, t: Array, duration: Array, substeps: Arra
     return jax.tree.map(lambda leaf: leaf[0], solution.ys)
 
 
-def _rates(whole: Scene, scene: Scene, t: Array, state: Any) -> tuple[Any, list, Any]:
+def _compute_rates(whole: Scene, scene: Scene, t: Array, state: Any) -> tuple[Any, list, Any]:
     """Time derivative of the state, and what each force, and what holds the scene, brings in a second."""
     rate = scene.rate(t, state)
-    seen = state if scene.led is None else scene.led.lead(t, state)
+    seen = state if scene.prescribed_motion is None else scene.prescribed_motion.prescribe(t, state)
     seen = seen.on_pivot(scene.mass) if hasattr(seen, "on_pivot") else seen
-    works = [_brings(whole, t, seen, _alone(scene, t, seen, force)) for force in scene.forces]
-    holding = _brings(whole, t, seen, rate)
+    works = [_transfer_rates(whole, t, seen, _single_force_rate(scene, t, seen, force)) for force in scene.forces]
+    holding = _transfer_rates(whole, t, seen, rate)
     for work in works:
-        holding = _minus(holding, work)
+        holding = _subtract(holding, work)
     for i, force in enumerate(whole.forces):
         if hasattr(force, "potential"):  # what is stored has not been brought
             stored = partial(_potential, force, whole)
@@ -277,13 +292,13 @@ def _rates(whole: Scene, scene: Scene, t: Array, state: Any) -> tuple[Any, list,
     return rate, works, holding
 
 
-def _alone(scene: Scene, t: Array, state: Any, force: Any) -> Any:
+def _single_force_rate(scene: Scene, t: Array, state: Any, force: Any) -> Any:
     """Time derivative of the state if this force were the only one."""
-    load = state.total((state.load(force, t, scene.mass),))
+    load = state.sum_loads((state.evaluate_load(force, t, scene.mass),))
     return state.rate(load if hasattr(state, "own_spin") else scale(1 / scene.mass, load), scene.mass)
 
 
-def _brings(scene: Scene, t: Array, state: Any, rate: Any) -> dict[str, Array]:
+def _transfer_rates(scene: Scene, t: Array, state: Any, rate: Any) -> dict[str, Array]:
     """Power [W], force [N] and torque about the origin [N m] of what changes the velocities so fast."""
-    after = lambda h: _amounts(scene, t, state.kick(rate, h), energy.kinetic)  # noqa: E731
+    after = lambda h: _measure_quantities(scene, t, state.kick(rate, h), energy.kinetic)  # noqa: E731
     return jax.jvp(after, (jnp.zeros(()),), (jnp.ones(()),))[1]

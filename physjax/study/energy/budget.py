@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.scene import Scene, project
-from physjax.study.energy.audit import LEGS, NUMERICAL, booked, causes
-from physjax.text import table
+from physjax.study.energy.audit import NUMERICAL, RESPONSE_OBSERVERS, audit_run, list_causes
+from physjax.text import format_table
 from physjax.trajectory import Trajectory
 
 UNITS = {"energy": "J", "momentum": "kg m/s", "angular momentum": "kg m²/s"}
-SUBSTEPS, MOST = 2, 512
+FIRST_SUBSTEPS, MAX_SUBSTEPS = 2, 512
 """Steps of order 8 for one of the run, at first and at most."""
-SETTLED = 1e-11
+SUBSTEP_TOLERANCE = 1e-11
 """The exact motion is exact enough when twice the substeps change no entry by more than this part of the largest."""
 
 
@@ -44,7 +44,7 @@ class Account(NamedTuple):
         return sum(self.received.values())
 
     @property
-    def closing(self) -> float:
+    def closure_error(self) -> float:
         """The largest gap in parts of the largest entry, or of the `size`: kinetic energy, Σm|v|, Σm|r||v|."""
         largest = max([float(np.abs(series).max()) for series in self.received.values()] + [float(self.size.max())])
         return float(np.abs(self.gap).max()) / largest if largest else 0.0
@@ -54,7 +54,7 @@ class Ledger(NamedTuple):
     """Where energy, momentum and angular momentum of a run went. Printed, it is a table of the totals over all lanes.
 
     `time` [s] is of the frames. `angular_momentum`, about the origin, is None in one dimension. `substeps` of order 8
-    followed the exact motion through each step; `unsettled` is by how much fewer of them would change the largest entry.
+    followed the exact motion through each step; `substep_error` is by how much fewer of them would change the largest entry.
     """
 
     time: np.ndarray
@@ -63,7 +63,7 @@ class Ledger(NamedTuple):
     momentum: Account
     angular_momentum: Account | None
     substeps: int
-    unsettled: float
+    substep_error: float
 
     @property
     def accounts(self) -> dict[str, Account]:
@@ -76,10 +76,10 @@ class Ledger(NamedTuple):
         headers, columns = ["received by", *(f"{name} [{a.unit}]" for name, a in self.accounts.items())], []
         for account in self.accounts.values():
             totals = account.totals | {"sum": account.gap[-1]}
-            columns.append([_text(account, totals.get(label)) for label in (*labels, "sum")])
+            columns.append([_format_total(account, totals.get(label)) for label in (*labels, "sum")])
         rows = [[label, *cells] for label, *cells in zip((*labels, "sum"), *columns, strict=True)]
         span = f"{float(np.max(self.time[-1] - self.time[0])):.6g} s of {self.method}"
-        return f"{span}; {NUMERICAL}: what the method made itself\n{table(headers, rows)}"
+        return f"{span}; {NUMERICAL}: what the method made itself\n{format_table(headers, rows)}"
 
     def plot(self, figure: Any = None) -> Any:
         """Draw the energy over time and its totals; returns the matplotlib figure."""
@@ -88,21 +88,21 @@ class Ledger(NamedTuple):
         return draw_energy_budget(self, figure)
 
 
-def _text(account: Account, total: np.ndarray | None) -> str:
+def _format_total(account: Account, total: np.ndarray | None) -> str:
     """A total over all lanes, component by component."""
     if total is None:
         return ""
-    parts = over_lanes(account, total)
+    parts = sum_lanes(account, total)
     return ", ".join(f"{part:.4g}" for part in np.atleast_1d(parts))
 
 
-def over_lanes(account: Account, amounts: np.ndarray) -> np.ndarray:
+def sum_lanes(account: Account, amounts: np.ndarray) -> np.ndarray:
     """Amounts without the axis of frames, summed over all lanes; the components of a vector stay."""
     lanes = account.size.ndim - 1
     return amounts.sum(axis=tuple(range(lanes))) if lanes else amounts
 
 
-def closed_books(run: Trajectory, scene: Scene | None = None) -> Ledger:
+def build_ledger(run: Trajectory, scene: Scene | None = None) -> Ledger:
     """See `energy.ledger`."""
     if not isinstance(run, Trajectory):
         raise TypeError(f"ledger: got a {type(run).__name__}, expected the Trajectory that simulate returns.")
@@ -119,58 +119,60 @@ def closed_books(run: Trajectory, scene: Scene | None = None) -> Ledger:
             "it when they die."
         )
     for contact in run.scene.contacts:
-        if (contact.response or project) not in (*LEGS, project):
+        if (contact.response or project) not in (*RESPONSE_OBSERVERS, project):
             raise ValueError(
                 f"ledger: {type(contact).__name__} has a response of its own, expected one of physjax: what is done to a "
                 "touch must be known."
             )
     with jax.enable_x64(True):
-        stock, brought, substeps, unsettled = _settled(run)
-    return _told(run, stock, brought, substeps, unsettled)
+        stock, brought, substeps, substep_error = _refine_substeps(run)
+    return _build_accounts(run, stock, brought, substeps, substep_error)
 
 
-def _settled(run: Trajectory) -> tuple[Any, Any, int, float]:
+def _refine_substeps(run: Trajectory) -> tuple[Any, Any, int, float]:
     """The books with as many substeps as change them no more."""
-    substeps = SUBSTEPS
-    stock, before = _audit(run, substeps)
+    substeps = FIRST_SUBSTEPS
+    stock, before = _audit_with_substeps(run, substeps)
     while True:
         substeps *= 2
-        _, brought = _audit(run, substeps)
-        change = max(_change(before, brought, stock, name) for name in stock["amounts"])
-        if not change > SETTLED or substeps >= MOST:
+        _, brought = _audit_with_substeps(run, substeps)
+        change = max(_largest_change(before, brought, stock, name) for name in stock["amounts"])
+        if not change > SUBSTEP_TOLERANCE or substeps >= MAX_SUBSTEPS:
             return stock, brought, substeps, change
         before = brought
 
 
-def _audit(run: Trajectory, substeps: int) -> tuple[Any, Any]:
-    return jax.tree.map(np.asarray, booked(run, jnp.asarray(substeps)))
+def _audit_with_substeps(run: Trajectory, substeps: int) -> tuple[Any, Any]:
+    return jax.tree.map(np.asarray, audit_run(run, jnp.asarray(substeps)))
 
 
-def _change(before: Any, brought: Any, stock: Any, name: str) -> float:
+def _largest_change(before: Any, brought: Any, stock: Any, name: str) -> float:
     """The largest change of an entry, in parts of the largest that the quantity has."""
     largest = np.abs(stock["amounts"][name] - stock["amounts"][name][:1]).max()
-    sums = lambda books, cause: np.cumsum(books[cause][name], axis=0)  # noqa: E731
+    sums = lambda budget, cause: np.cumsum(budget[cause][name], axis=0)  # noqa: E731
     largest = max([largest, stock["sizes"][name].max()] + [np.abs(sums(brought, cause)).max() for cause in brought])
     change = max(np.abs(sums(brought, cause) - sums(before, cause)).max() for cause in brought)
     return float(change / largest) if largest else 0.0
 
 
-def _told(run: Trajectory, stock: Any, brought: Any, substeps: int, unsettled: float) -> Ledger:
+def _build_accounts(run: Trajectory, stock: Any, brought: Any, substeps: int, substep_error: float) -> Ledger:
     """The accounts, summed up frame by frame; a run that came out of vmap has its axis behind that of the frames."""
     batched = run.first_step.ndim
     frames_first = lambda series: np.moveaxis(series, batched, 0) if batched else series  # noqa: E731
-    stock, brought = (jax.tree.map(frames_first, books) for books in (stock, brought))
+    stock, brought = (jax.tree.map(frames_first, budget) for budget in (stock, brought))
     gained = lambda series: series - series[:1]  # noqa: E731
     accounts = {}
     for name, amount in stock["amounts"].items():
         stores = stock["stored"] if name == "energy" else {"scene": amount}
         received = {store: gained(series) for store, series in stores.items()}
-        for cause in (label for labels in causes(run.scene) for label in labels):
+        for cause in (label for labels in list_causes(run.scene) for label in labels):
             total = np.cumsum(brought[cause][name], axis=0)
             received[cause] = -np.concatenate([np.zeros_like(total[:1]), total])
         silent = {cause for cause in received if name == "energy" and f"potential of {cause}" in received}
         largest = max(np.abs(series).max() for series in received.values())
-        received = {n: s for n, s in received.items() if n not in silent or np.abs(s).max() > SETTLED * largest}
+        received = {
+            n: s for n, s in received.items() if n not in silent or np.abs(s).max() > SUBSTEP_TOLERANCE * largest
+        }
         accounts[name] = Account(UNITS[name], received, stock["sizes"][name])
     return Ledger(
         np.asarray(frames_first(np.asarray(run.time, float))),
@@ -179,5 +181,5 @@ def _told(run: Trajectory, stock: Any, brought: Any, substeps: int, unsettled: f
         accounts["momentum"],
         accounts.get("angular momentum"),
         substeps,
-        unsettled,
+        substep_error,
     )

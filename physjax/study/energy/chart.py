@@ -7,7 +7,7 @@ import numpy as np
 from physjax.show.style import PALETTE
 
 NUMERICAL_COLOUR = "0.15"
-LINES = ("-", "--", ":")
+LINE_STYLES = ("-", "--", ":")
 
 
 def draw_energy_budget(result: Any, figure: Any = None) -> Any:
@@ -20,30 +20,33 @@ def draw_energy_budget(result: Any, figure: Any = None) -> Any:
     series = {name: received.sum(axis=lanes) for name, received in account.received.items()}
     figure = figure or plt.figure(figsize=(9, 3.2 + 0.42 * len(series)), layout="constrained")
     over_time, bars = figure.subplots(2, 1, height_ratios=(7, 1 + len(series)))
-    styles = _styles(series)
+    styles = _choose_styles(series)
     for name, received in series.items():
         over_time.plot(time, received, label=name, **styles[name])
     over_time.axhline(0, color="0.7", linewidth=0.8, zorder=0)
     over_time.set(xlabel="time [s]", ylabel="energy received [J]", xlim=(time[0], time[-1]))
     over_time.set_title(f"Where the energy went, stepped by {result.method}", fontsize=11)
     over_time.legend(fontsize=9, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _totals(bars, {name: received[-1] for name, received in series.items()}, styles)
+    _draw_totals(bars, {name: received[-1] for name, received in series.items()}, styles)
     bars.set_title(
-        f"Totals at {time[-1]:.4g} s; their sum is zero within {account.closing:.0e} of the largest", fontsize=11
+        f"Totals at {time[-1]:.4g} s; their sum is zero within {account.closure_error:.0e} of the largest", fontsize=11
     )
     return figure
 
 
-def _styles(names: Any) -> dict[str, dict]:
+def _choose_styles(names: Any) -> dict[str, dict]:
     """A colour for each entry; the method's own share is black and thick."""
     colours = [colour for colour in PALETTE if colour != PALETTE[0]]
     styles = {}
     for i, name in enumerate(name for name in names if name != "numerical"):
-        styles[name] = {"color": colours[i % len(colours)], "linestyle": LINES[i // len(colours) % len(LINES)]}
+        styles[name] = {
+            "color": colours[i % len(colours)],
+            "linestyle": LINE_STYLES[i // len(colours) % len(LINE_STYLES)],
+        }
     return styles | {"numerical": {"color": NUMERICAL_COLOUR, "linestyle": "-", "linewidth": 2.2}}
 
 
-def _totals(ax: Any, totals: dict[str, float], styles: dict[str, dict]) -> None:
+def _draw_totals(ax: Any, totals: dict[str, float], styles: dict[str, dict]) -> None:
     """A bar for each entry with its number, the first on top."""
     places = np.arange(len(totals))
     values = np.array(list(totals.values()))

@@ -44,7 +44,7 @@ def potential(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
         >>> float(energy.potential(shot, 0.0, ball))
         196.0
     """
-    see = lambda f: state.shown_to(f, scene.mass)  # noqa: E731
+    see = lambda f: state.view_for_force(f, scene.mass)  # noqa: E731
     terms = [f.potential(t, *see(f)) for f in scene.forces if hasattr(f, "potential")]
     return summed(scene, sum(terms, jnp.zeros_like(state.position[..., 0])))
 
@@ -84,7 +84,7 @@ def angular_momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..
     return jnp.sum(spin, axis=-2) if scene.couples else spin
 
 
-def _arms(scene: Scene, state: Any) -> Array:
+def _angular_momentum_size(scene: Scene, state: Any) -> Array:
     arms = norm(state.position) * norm(state.linear_momentum(scene.mass))
     return arms + norm(state.own_spin(scene.mass)) if hasattr(state, "own_spin") else arms
 
@@ -106,7 +106,7 @@ MOMENTUM = Conserved("momentum", momentum, lambda scene, t, s: summed(scene, nor
 ANGULAR_MOMENTUM = Conserved(
     "angular momentum",
     angular_momentum,
-    lambda scene, t, s: summed(scene, _arms(scene, s)),
+    lambda scene, t, s: summed(scene, _angular_momentum_size(scene, s)),
 )
 """Angular momentum about the origin, its errors measured by Σm|r||v|, and |L| of rigid bodies."""
 
@@ -125,6 +125,6 @@ def ledger(trajectory: Trajectory, scene: Scene | None = None) -> Any:
         >>> round(float(received["kinetic"]), 2), round(float(received["potential of Gravity"]), 2)
         (227.36, -227.36)
     """
-    from physjax.study.energy.budget import closed_books
+    from physjax.study.energy.budget import build_ledger
 
-    return closed_books(trajectory, scene)
+    return build_ledger(trajectory, scene)

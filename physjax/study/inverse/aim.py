@@ -18,18 +18,25 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete, demand, positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none, demand_all
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
 from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import Scene
 from physjax.stepping.methods import rk4
-from physjax.study.inverse.ricochet import find_bounced
-from physjax.study.inverse.shooting import Launch, Range, chosen, find, first_guess, nearest
+from physjax.study.inverse.ricochet import find_ricochet
+from physjax.study.inverse.shooting import (
+    AimProblem,
+    Launch,
+    find_launch,
+    find_nearest_launch,
+    guess_launch,
+    select_where,
+)
 from physjax.trajectory import Trajectory
 from physjax.vectors import dot, norm
 
-STEPS = 200
+FLIGHT_STEPS = 200
 """Steps of a flight unless told otherwise."""
 
 
@@ -66,7 +73,7 @@ class Aimed(eqx.Module):
 
     low: Shot
     high: Shot
-    shots: Range
+    shots: AimProblem
 
     @property
     def ok(self) -> Bool[Array, "*lanes"]:
@@ -80,7 +87,7 @@ class Aimed(eqx.Module):
 
     def scene(self, shot: Shot) -> Scene:
         """The scene with the launch velocity of a shot, to be simulated."""
-        return self.shots.fired(shot.velocity)
+        return self.shots.with_launch_velocity(shot.velocity)
 
     def flight(self, shot: Shot) -> Trajectory:
         """The whole flight of a shot, every step a frame; it ends at the target."""
@@ -101,7 +108,7 @@ def aim_at(
     speed: ArrayLike | None = None,
     bounces: int = 0,
     method: Callable = rk4,
-    steps: int = STEPS,
+    steps: int = FLIGHT_STEPS,
 ) -> Aimed:
     """The launches from where the scene's lanes are that hit a target `(*lanes, dim)` [m] at a speed [m/s].
 
@@ -121,40 +128,40 @@ def aim_at(
         >>> [round(float(np.rad2deg(shot.angle))) for shot in (aimed.low, aimed.high)]
         [15, 75]
     """
-    shots = _range(scene, target, method, steps)
-    bounces = _checked_bounces(bounces, speed, shots.scene)
+    shots = _check_problem(scene, target, method, steps)
+    bounces = _check_bounces(bounces, speed, shots.scene)
     if speed is not None:
-        speed = real_quantity("speed [m/s]", speed, above=0).astype(shots.target.dtype)
+        speed = as_real_quantity("speed [m/s]", speed, above=0).astype(shots.target.dtype)
         if speed.shape not in ((), shots.target.shape[:-1]):
             raise ValueError(
                 f"speed [m/s]: got shape {speed.shape}, expected () or {shots.target.shape[:-1]}, one for each target."
             )
         speed = jnp.broadcast_to(speed, shots.target.shape[:-1])
-    return Aimed(*_both_arcs(shots, speed, bounces), shots)
+    return Aimed(*_solve_both_arcs(shots, speed, bounces), shots)
 
 
 @eqx.filter_jit
-def _both_arcs(shots: Range, speed: Array | None, bounces: int) -> tuple[Shot, Shot]:
+def _solve_both_arcs(shots: AimProblem, speed: Array | None, bounces: int) -> tuple[Shot, Shot]:
     if speed is None:
-        shot = _shot(shots, None, None, bounces)
+        shot = _solve_arc(shots, None, None, bounces)
         return shot, shot
-    both = lax.map(lambda late: _shot(shots, speed, late, bounces), jnp.array([False, True]))
+    both = lax.map(lambda late: _solve_arc(shots, speed, late, bounces), jnp.array([False, True]))
     return tuple(jax.tree.map(lambda leaf, i=i: leaf[i], both) for i in (0, 1))
 
 
-def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -> Shot:
+def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounces: int) -> Shot:
     """One arc. Without bounces it is searched in free flight; what is in the way shows when it is flown."""
     if bounces:
-        launch, legal = _implicit(shots, speed, lambda: find_bounced(shots, speed, late, bounces))
+        launch, legal = _differentiate_implicitly(shots, speed, lambda: find_ricochet(shots, speed, late, bounces))
     else:
-        free = Range(shots.scene.having(contacts=()), shots.target, shots.method, shots.steps)
-        launch, legal = _implicit(free, speed, lambda: _searched(free, speed, late))
+        free = AimProblem(shots.scene.replace(contacts=()), shots.target, shots.method, shots.steps)
+        launch, legal = _differentiate_implicitly(free, speed, lambda: _search_free_flight(free, speed, late))
     up = shots.scene.up
     across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
-    flight = shots.flight(launch, save_every=1, record=_HEIGHTS[up])
+    flight = shots.flight(launch, save_every=1, record=_HEIGHT_RECORDERS[up])
     residual = flight.final_scene.state.position - shots.target
     ok = legal & (norm(residual) <= shots.rounding(launch))
-    velocity, time = launch = _fixed_unless(ok, launch)
+    velocity, time = launch = _stop_gradient_unless(ok, launch)
     level = [velocity[..., axis] for axis in across]
     forward = level[0] if len(level) == 1 else norm(jnp.stack(level, axis=-1))
     return Shot(
@@ -163,31 +170,31 @@ def _shot(shots: Range, speed: Array | None, late: Array | None, bounces: int) -
         speed=norm(velocity) if speed is None else speed,
         time=time,
         velocity=velocity,
-        apex=_fixed_unless(ok, _apex(flight.recorded, launch.time / shots.steps)),
-        residual=_fixed_unless(ok, residual),
+        apex=_stop_gradient_unless(ok, _apex_height(flight.recorded, launch.time / shots.steps)),
+        residual=_stop_gradient_unless(ok, residual),
         ok=ok,
     )
 
 
-def _searched(shots: Range, speed: Array | None, late: Array | None) -> tuple[Launch, Array]:
+def _search_free_flight(shots: AimProblem, speed: Array | None, late: Array | None) -> tuple[Launch, Array]:
     """The launch that hits or, at a given speed, comes nearest; of those any will do."""
-    launch, found = find(shots, speed, late)
+    launch, found = find_launch(shots, speed, late)
     if speed is None:
         return launch, found
     # without a force to bring it back there is no high arc, and the search for it runs away
-    launch = chosen(norm(launch.velocity) > 0.5 * speed, launch, first_guess(shots, speed))
+    launch = select_where(norm(launch.velocity) > 0.5 * speed, launch, guess_launch(shots, speed))
     too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * shots.rounding(launch)
-    launch, _ = nearest(shots, launch, speed, too_fast | ~found)
+    launch, _ = find_nearest_launch(shots, launch, speed, too_fast | ~found)
     return launch, jnp.ones_like(found)
 
 
-def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Launch, Array]:
+def _differentiate_implicitly(shots: AimProblem, speed: Array | None, search: Callable) -> tuple[Launch, Array]:
     """What the search finds, the launch with the derivatives of the implicit function theorem: it is a root of `conditions`."""
 
     def conditions(packed):
         launch = Launch(packed[..., :-1], packed[..., -1])
         if speed is None:
-            miss, turn = shots.following(launch)  # in units of velocity, which has the same root
+            miss, turn = shots.newton_correction(launch)  # in units of velocity, which has the same root
             last = dot(launch.velocity, turn)
         else:
             miss = shots.miss(launch)
@@ -200,11 +207,11 @@ def _implicit(shots: Range, speed: Array | None, search: Callable) -> tuple[Laun
         return jnp.concatenate([launch.velocity, launch.time[..., None]], axis=-1), legal.astype(start.dtype)
 
     start = jnp.zeros((*shots.target.shape[:-1], shots.target.shape[-1] + 1), shots.target.dtype)
-    packed, legal = lax.custom_root(conditions, start, packed_search, _solved_by_lane, has_aux=True)
+    packed, legal = lax.custom_root(conditions, start, packed_search, _solve_by_lane, has_aux=True)
     return Launch(packed[..., :-1], packed[..., -1]), legal > 0
 
 
-def _solved_by_lane(linear: Callable, b: Array) -> Array:
+def _solve_by_lane(linear: Callable, b: Array) -> Array:
     """The solution of linear(x) = b, a small system for each lane; zero where that is singular."""
     size = b.shape[-1]
     rows = jnp.eye(size, dtype=b.dtype)
@@ -218,16 +225,16 @@ def _solved_by_lane(linear: Callable, b: Array) -> Array:
     return jnp.where(sound[..., None], jnp.linalg.solve(matrix, b[..., None])[..., 0], 0.0)
 
 
-def _height(t: Array, state: Any, *, up: int) -> tuple[Array, Array]:
+def _record_height(t: Array, state: Any, *, up: int) -> tuple[Array, Array]:
     """Height [m] and rate of climb [m/s]."""
     return state.position[..., up], state.velocity[..., up]
 
 
-_HEIGHTS = [partial(_height, up=axis) for axis in range(3)]
+_HEIGHT_RECORDERS = [partial(_record_height, up=axis) for axis in range(3)]
 """What is recorded of a flight, by the axis that is up; named once, since a new function would compile anew."""
 
 
-def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:
+def _apex_height(recorded: tuple[Array, Array], dt: Array) -> Array:
     """The greatest height [m]: of the frames, and of the cubic through two frames between which the flight turns down."""
     height, climb = recorded
     (y0, y1), (v0, v1) = ((a[:-1], a[1:]) for a in (height, climb))
@@ -242,13 +249,13 @@ def _apex(recorded: tuple[Array, Array], dt: Array) -> Array:
     return jnp.maximum(jnp.max(top, axis=0), height[-1])
 
 
-def _fixed_unless(ok: Array, values: Any) -> Any:
+def _stop_gradient_unless(ok: Array, values: Any) -> Any:
     """The values, which do not move with anything where a lane is not ok."""
-    return chosen(ok, values, lax.stop_gradient(values))
+    return select_where(ok, values, lax.stop_gradient(values))
 
 
-def _checked_bounces(bounces: int, speed: Any, scene: Scene) -> int:
-    bounces = positive_integer("bounces", bounces, at_least=0)
+def _check_bounces(bounces: int, speed: Any, scene: Scene) -> int:
+    bounces = as_positive_integer("bounces", bounces, at_least=0)
     if bounces and speed is None:
         raise ValueError(
             "aim_at: got bounces without speed=, expected a speed: the least is found in free flight only."
@@ -261,13 +268,13 @@ def _checked_bounces(bounces: int, speed: Any, scene: Scene) -> int:
     return bounces
 
 
-def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Range:
+def _check_problem(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> AimProblem:
     """Scene and targets with the same lanes, checked."""
     if not isinstance(scene, Scene):
         raise TypeError(f"aim_at: got a {type(scene).__name__}, expected a Scene whose position is where it is fired.")
     if not callable(method):
         raise TypeError(f"aim_at: got the method {method!r}, expected a method of stepping, e.g. methods.rk4.")
-    steps = positive_integer("steps", steps)
+    steps = as_positive_integer("steps", steps)
     demand_particles("aim_at", scene.state, "a launch is a position and a velocity")
     if scene.pinned is not None:
         raise ValueError("aim_at: got a scene with pinned lanes, expected a launch velocity that is free. Unpin them.")
@@ -279,7 +286,7 @@ def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Ran
     position = scene.state.position
     if position.shape[-1] not in (2, 3):
         raise ValueError(f"aim_at: got positions with {position.shape[-1]} components, expected 2 or 3.")
-    target = real_quantity("target [m]", target).astype(position.dtype)
+    target = as_real_quantity("target [m]", target).astype(position.dtype)
     if target.ndim == 0 or target.shape[-1] != position.shape[-1]:
         raise ValueError(
             f"target [m]: got shape {target.shape}, expected (*lanes, {position.shape[-1]}), as many components as the "
@@ -294,7 +301,9 @@ def _range(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> Ran
     shape = (lanes or here) + position.shape[-1:]
     position, target = jnp.broadcast_to(position, shape), jnp.broadcast_to(target, shape)
     away = norm(target - position)
-    if concrete(away) is not None:
-        demand("distance from launch to target [m]", away, concrete(away) > 0, "a target away from the launch")
+    if concrete_or_none(away) is not None:
+        demand_all(
+            "distance from launch to target [m]", away, concrete_or_none(away) > 0, "a target away from the launch"
+        )
     at_rest = Particles(position, jnp.zeros_like(position))
-    return Range(scene.having(state=at_rest), target, as_module(method), steps)
+    return AimProblem(scene.replace(state=at_rest), target, as_module(method), steps)

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from physjax.show import obstacles
-from physjax.show.stage import Stage, axes
+from physjax.show.stage import Stage, create_axes
 
-LOW, HIGH = "#0072B2", "#D55E00"
+LOW_COLOUR, HIGH_COLOUR = "#0072B2", "#D55E00"
 """Colours of the arcs, told apart by the colour-blind too."""
-WIDTH = 7.2
+FIGURE_WIDTH_INCHES = 7.2
 """Of a figure of its own [inches]."""
 
 
@@ -19,23 +19,29 @@ def draw_shots(aimed: Any, *, every: int = 1, ax: Any = None) -> Any:
 
     one = np.array_equal(aimed.low.time, aimed.high.time, equal_nan=True)
     arcs = {"both arcs": aimed.low} if one else {"low arc": aimed.low, "high arc": aimed.high}
-    paths = {name: _by_lane(aimed.flight(shot).position, 1)[:, ::every] for name, shot in arcs.items()}
-    target = _by_lane(aimed.target)[::every]
+    paths = {name: _flatten_lanes(aimed.flight(shot).position, 1)[:, ::every] for name, shot in arcs.items()}
+    target = _flatten_lanes(aimed.target)[::every]
     points = np.concatenate([*(path.reshape(-1, target.shape[-1]) for path in paths.values()), target])
     points = points[np.isfinite(points).all(axis=-1)]
-    contacts = obstacles.shown(aimed.shots.scene.contacts)
-    stage = obstacles.with_obstacles(Stage(points.min(axis=0), points.max(axis=0)), contacts).grown(0.05)
+    contacts = obstacles.select_shared_surfaces(aimed.shots.scene.contacts)
+    stage = obstacles.include_obstacles(Stage(points.min(axis=0), points.max(axis=0)), contacts).expand(0.05)
     own, above = ax is None, aimed.shots.scene.up
     if own:
         across, up = (stage.high - stage.low)[:2]
-        height = 0.8 * WIDTH if target.shape[-1] == 3 else float(np.clip(0.9 * WIDTH * up / across, 2.2, WIDTH)) + 1.2
-        ax = axes(plt.figure(figsize=(WIDTH, height), layout="constrained"), (1, 1, 1), stage, above)
+        height = (
+            0.8 * FIGURE_WIDTH_INCHES
+            if target.shape[-1] == 3
+            else float(np.clip(0.9 * FIGURE_WIDTH_INCHES * up / across, 2.2, FIGURE_WIDTH_INCHES)) + 1.2
+        )
+        ax = create_axes(
+            plt.figure(figsize=(FIGURE_WIDTH_INCHES, height), layout="constrained"), (1, 1, 1), stage, above
+        )
     if target.shape[-1] == 2:
-        obstacles.flat(ax, stage, contacts, 0.0)
+        obstacles.draw_flat(ax, stage, contacts, 0.0)
     else:
-        obstacles.in_space(ax, stage, contacts, 0.0, above)
-    for (name, shot), colour in zip(arcs.items(), (LOW, HIGH), strict=False):
-        _arc(ax, paths[name], np.asarray(shot.ok).ravel()[::every], colour, _words(name, shot))
+        obstacles.draw_in_space(ax, stage, contacts, 0.0, above)
+    for (name, shot), colour in zip(arcs.items(), (LOW_COLOUR, HIGH_COLOUR), strict=False):
+        _draw_arc(ax, paths[name], np.asarray(shot.ok).ravel()[::every], colour, _describe_arc(name, shot))
     start = next(iter(paths.values()))[0]
     ax.plot(*start.T, "o", color="0.25", markersize=4, linestyle="")
     ax.plot(*target.T, "x", color="black", markersize=8, markeredgewidth=2, linestyle="", label="target", zorder=5)
@@ -46,14 +52,14 @@ def draw_shots(aimed: Any, *, every: int = 1, ax: Any = None) -> Any:
     return ax
 
 
-def _arc(ax: Any, path: np.ndarray, ok: np.ndarray, colour: str, label: str) -> None:
+def _draw_arc(ax: Any, path: np.ndarray, ok: np.ndarray, colour: str, label: str) -> None:
     """The paths of an arc `(frames, lanes, dim)`, one entry in the legend for all."""
     for lane in range(path.shape[1]):
         line = "-" if ok[lane] else "--"
         ax.plot(*path[:, lane].T, line, color=colour, linewidth=1.6, label=label if lane == 0 else None)
 
 
-def _words(name: str, shot: Any) -> str:
+def _describe_arc(name: str, shot: Any) -> str:
     """What the legend says of an arc; with numbers where it is one."""
     if np.ndim(shot.time):
         return name if np.all(shot.ok) else f"{name} (dashed: nearest miss)"
@@ -64,7 +70,7 @@ def _words(name: str, shot: Any) -> str:
     return words if shot.ok else f"{words}, misses by {float(shot.miss):.3g} m"
 
 
-def _by_lane(array: Any, leading: int = 0) -> np.ndarray:
+def _flatten_lanes(array: Any, leading: int = 0) -> np.ndarray:
     """All lanes on one axis, behind so many leading ones."""
     array = np.asarray(array, float)
     return array.reshape(*array.shape[:leading], -1, array.shape[-1])

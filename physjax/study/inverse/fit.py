@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.checks import concrete, positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.study.inverse.solve import solve
 
 
@@ -53,19 +53,19 @@ def fit(predict: Callable, guess: Any, observed: Any, *, sigma: Any = None, max_
         raise TypeError(
             f"fit: got predict {predict!r}, expected a function of the numbers that returns the prediction."
         )
-    max_steps = positive_integer("max_steps", max_steps)
-    guess = jax.tree.map(lambda leaf: real_quantity("guess", leaf), guess)
+    max_steps = as_positive_integer("max_steps", max_steps)
+    guess = jax.tree.map(lambda leaf: as_real_quantity("guess", leaf), guess)
     start, unravel = ravel_pytree(guess)
     seen = jax.eval_shape(predict, guess)
     if isinstance(seen, jax.ShapeDtypeStruct) and isinstance(observed, list | tuple):
         observed = np.asarray(observed)  # what NumPy takes for an array is one here too, not a tree of numbers
-    observed = _matched("observed", jax.tree.map(lambda leaf: jnp.asarray(leaf), observed), seen)
+    observed = _match_structure("observed", jax.tree.map(lambda leaf: jnp.asarray(leaf), observed), seen)
     data, unravel_data = ravel_pytree(observed)
     present = ~jnp.isnan(data)
-    _demand_enough(present, start.size + (sigma is None))
+    _demand_observations(present, start.size + (sigma is None))
     weight = present.astype(data.dtype)
     if sigma is not None:
-        weight = weight / _noise(sigma, seen)
+        weight = weight / _expand_sigma(sigma, seen)
 
     def residual(z):
         predicted = ravel_pytree(predict(unravel(start + unit * z)))[0]
@@ -106,7 +106,7 @@ def _covariance(jacobian: Array, variance: Array, unit: Array) -> tuple[Array, A
     return jnp.where(known, variance * (inverse @ inverse.T), jnp.inf), known
 
 
-def _matched(name: str, tree: Any, seen: Any) -> Any:
+def _match_structure(name: str, tree: Any, seen: Any) -> Any:
     """The tree as floating-point arrays, if it has the structure and the shapes of what is predicted."""
     shapes = lambda tree: jax.tree.map(lambda leaf: leaf.shape, tree)  # noqa: E731
     if shapes(tree) != shapes(seen):
@@ -117,18 +117,18 @@ def _matched(name: str, tree: Any, seen: Any) -> Any:
     return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), tree, seen)
 
 
-def _noise(sigma: Any, seen: Any) -> Array:
+def _expand_sigma(sigma: Any, seen: Any) -> Array:
     """The standard deviation of every observation."""
-    sigma = jax.tree.map(lambda leaf: real_quantity("sigma", leaf, above=0.0), sigma)
+    sigma = jax.tree.map(lambda leaf: as_real_quantity("sigma", leaf, above=0.0), sigma)
     if eqx.is_array(sigma) and sigma.ndim == 0:
         sigma = jax.tree.map(lambda leaf: jnp.broadcast_to(sigma, leaf.shape), seen)
-    return ravel_pytree(_matched("sigma", sigma, seen))[0]
+    return ravel_pytree(_match_structure("sigma", sigma, seen))[0]
 
 
-def _demand_enough(present: Array, needed: int) -> None:
-    told = concrete(present)
-    if told is not None and told.sum() < needed:
+def _demand_observations(present: Array, needed: int) -> None:
+    concrete_present = concrete_or_none(present)
+    if concrete_present is not None and concrete_present.sum() < needed:
         raise ValueError(
-            f"observed: got {told.sum()} numbers that are not NaN, expected at least {needed}: one for each number to be "
+            f"observed: got {concrete_present.sum()} numbers that are not NaN, expected at least {needed}: one for each number to be "
             "fitted, and one more if sigma is to be estimated."
         )

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from physjax.show.plot import MOST_LANES
+from physjax.show.plot import MAX_DRAWN_LANES
 from physjax.show.style import PALETTE
-from physjax.text import seconds_text
+from physjax.text import format_seconds
 
 
 def draw_gradient_health(result: Any, ax: Any = None) -> Any:
@@ -24,7 +24,7 @@ def draw_gradient_health(result: Any, ax: Any = None) -> Any:
     limit, horizon = (np.asarray(number, float).ravel() for number in (result.limit, result.horizon))
     one, end = grown.shape[1] == 1, time[-1]
     line = {"color": PALETTE[3], "linewidth": 1.5 if one else 0.8, "alpha": 1.0 if one else 0.6}
-    for lane in range(0, grown.shape[1], math.ceil(grown.shape[1] / MOST_LANES)):
+    for lane in range(0, grown.shape[1], math.ceil(grown.shape[1] / MAX_DRAWN_LANES)):
         seen = grown[:, lane] > 0
         ax.plot(time[seen, lane], grown[seen, lane], **line)
         if end[lane] < horizon[lane] < 3 * end[lane] and np.ravel(result.exponential)[lane]:
@@ -36,7 +36,7 @@ def draw_gradient_health(result: Any, ax: Any = None) -> Any:
     place = {"xycoords": ax.get_yaxis_transform(), "xytext": (0, -3), "textcoords": "offset points", "va": "top"}
     ax.annotate(words, (0.02, limit.min()), fontsize=9, color=PALETTE[0], **place)
     first = horizon.min()
-    until = f"up to {seconds_text(first)}" if first < 1e3 * end.max() else "for more than a thousand such runs"
+    until = f"up to {format_seconds(first)}" if first < 1e3 * end.max() else "for more than a thousand such runs"
     ax.set(
         yscale="log",
         xlabel="time [s]",

@@ -10,15 +10,15 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import known, real_quantity
+from physjax.checks import as_real_quantity, demand_known
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.simulate import simulate
 from physjax.vectors import dot, norm
 
-ROUNDED = 100.0
+MISMATCH_ROUNDING_FACTOR = 100.0
 """Times the share to which rounding grows along a path: so far apart may the two modes be."""
-PROBES = 32
+MAX_PROBES = 32
 """Directions looked at: all there are, if they are no more; else random ones, whose mean square is right to a quarter."""
 
 
@@ -89,17 +89,17 @@ def health(
         >>> round(float(told.power), 3), round(float(told.sensitivity[-1]), 3)
         (1.0, 2.0)
     """
-    known("kind of deviation", of, ("position", "velocity"))
-    fraction = real_quantity("fraction", fraction, above=0.0)
+    demand_known("kind of deviation", of, ("position", "velocity"))
+    fraction = as_real_quantity("fraction", fraction, above=0.0)
     if error is not None:
-        error = real_quantity(f"error [{'m' if of == 'position' else 'm/s'}]", error, above=0.0)
+        error = as_real_quantity(f"error [{'m' if of == 'position' else 'm/s'}]", error, above=0.0)
     if size is not None:
-        size = real_quantity("size [m]", size, above=0.0)
-    ways = _ways(scene)
+        size = as_real_quantity("size [m]", size, above=0.0)
+    ways = _choose_directions(scene)
 
     def frames(leaf):
         state = scene.state._replace(**{of: leaf})
-        run = simulate(scene.having(state=state), method, dt=dt, steps=steps, duration=duration, save_every=save_every)
+        run = simulate(scene.replace(state=state), method, dt=dt, steps=steps, duration=duration, save_every=save_every)
         return run.position, run
 
     start = getattr(scene.state, of)
@@ -108,28 +108,34 @@ def health(
     square = jnp.mean(dot(moves, moves), axis=0)
     sensitivity = jnp.sqrt(jnp.sum(square, axis=-1) if scene.couples else square)
     if error is None:
-        typical = _largest(scene, norm(getattr(run, of)))
+        typical = _find_largest(scene, norm(getattr(run, of)))
         error = float(jnp.finfo(start.dtype).eps) * jnp.where(typical > 0, typical, 1.0)
     if size is None:
-        way, place = (_largest(scene, norm(x)) for x in (position - position[:1], position))
+        way, place = (_find_largest(scene, norm(x)) for x in (position - position[:1], position))
         # frames at which it is always back at its start tell of no way, but for rounding
         size = jnp.where(way > 64 * float(jnp.finfo(start.dtype).eps) * place, way, place)
     limit = jnp.broadcast_to(fraction.astype(start.dtype) * size / error, scene.status_shape)
     time = run.time.reshape(run.time.shape + (1,) * (sensitivity.ndim - run.time.ndim))
-    law = _law(time, sensitivity)
-    horizon = _horizon(time, sensitivity, limit, *law)
+    law = _fit_growth_law(time, sensitivity)
+    horizon = _find_horizon(time, sensitivity, limit, *law)
     mismatch, ok = None, jnp.ones(horizon.shape, bool)
     if reverse or (reverse is None and not (isinstance(method, Adaptive) and method.tries is None)):
         pull = jax.vjp(lambda leaf: frames(leaf)[0], start)[1]
-        mismatch, whole = _mismatch(scene, moves, jnp.broadcast_to(ways, (len(ways), *start.shape)), pull, sensitivity)
+        mismatch, whole = _measure_mismatch(
+            scene, moves, jnp.broadcast_to(ways, (len(ways), *start.shape)), pull, sensitivity
+        )
         # where paths from rounded starts go apart, so do the two programs
-        allowed = float(jnp.finfo(start.dtype).eps) ** 0.5 + ROUNDED * jnp.max(sensitivity, axis=0) / limit
+        allowed = (
+            float(jnp.finfo(start.dtype).eps) ** 0.5 + MISMATCH_ROUNDING_FACTOR * jnp.max(sensitivity, axis=0) / limit
+        )
         ok = jnp.isfinite(mismatch) & (mismatch <= allowed)
         horizon = jnp.where(ok | ~whole, horizon, 0.0)
     return GradientHealth(run.time, sensitivity, *law, limit, horizon, mismatch, ok, fraction, of)
 
 
-def _mismatch(scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivity: Array) -> tuple[Array, Array]:
+def _measure_mismatch(
+    scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivity: Array
+) -> tuple[Array, Array]:
     """How far reverse mode is from forward mode, as a share; and for which units forward mode is finite.
 
     Both give the derivative of one random mixture of all frames' positions along every way that was looked at.
@@ -148,42 +154,42 @@ def _mismatch(scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivi
     return jnp.where(jnp.isfinite(apart), apart, jnp.inf), whole
 
 
-def _ways(scene: Scene) -> Array:
+def _choose_directions(scene: Scene) -> Array:
     """Directions of the start's deviation, `(ways, *lanes, dim)` but for lanes that are independent, of length 1 on average."""
     shape = scene.state.position.shape[-1 - scene.couples :]
     count = shape[0] * shape[-1] if scene.couples else shape[-1]
-    if count <= PROBES:
-        return jnp.eye(count, dtype=scene.state.dtype).reshape(count, *_leading(scene), *shape)
-    random = jax.random.normal(jax.random.key(0), (PROBES, *shape), scene.state.dtype) / count**0.5
-    return random.reshape(PROBES, *_leading(scene), *shape)
+    if count <= MAX_PROBES:
+        return jnp.eye(count, dtype=scene.state.dtype).reshape(count, *_leading_shape(scene), *shape)
+    random = jax.random.normal(jax.random.key(0), (MAX_PROBES, *shape), scene.state.dtype) / count**0.5
+    return random.reshape(MAX_PROBES, *_leading_shape(scene), *shape)
 
 
-def _leading(scene: Scene) -> tuple[int, ...]:
+def _leading_shape(scene: Scene) -> tuple[int, ...]:
     """An axis of length 1 for each axis of lanes, or of scenes, that move alike."""
     return (1,) * len(scene.status_shape)
 
 
-def _largest(scene: Scene, length: Array) -> Array:
+def _find_largest(scene: Scene, length: Array) -> Array:
     """The largest of the lengths over the frames, as long as they are finite, and over the nodes where they are coupled."""
     largest = jnp.max(jnp.where(jnp.isfinite(length), length, 0.0), axis=0)
     return jnp.max(largest, axis=-1) if scene.couples else largest
 
 
-def _reached(sensitivity: Array) -> Array:
+def _log_peak_sensitivity(sensitivity: Array) -> Array:
     """The logarithm of the largest sensitivity so far; infinite from where the run blew up."""
     whole = jnp.where(jnp.isfinite(sensitivity), sensitivity, jnp.inf)
     return jnp.log(jnp.maximum(lax.cummax(whole, axis=0), float(jnp.finfo(sensitivity.dtype).tiny)))
 
 
-def _law(time: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
+def _fit_growth_law(time: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
     """Whether the growth is exponential, its rate [1/s], and else its power of time, by least squares of its logarithm.
 
     Over a short span the two are alike: nine tenths of the run decide which it is, the second half how fast it grows.
     """
-    grown = _reached(sensitivity)
+    grown = _log_peak_sensitivity(sensitivity)
 
     def fits(first):
-        return [_slope(t, grown[first:]) for t in (time[first:], jnp.log(time[first:]))]
+        return [_fit_slope(t, grown[first:]) for t in (time[first:], jnp.log(time[first:]))]
 
     (_, miss), (_, other) = fits(1 + len(time) // 10)
     (rate, _), (power, _) = fits(len(time) // 2)
@@ -191,18 +197,18 @@ def _law(time: Array, sensitivity: Array) -> tuple[Array, Array, Array]:
     return exponential, jnp.where(exponential, rate, 0.0), jnp.where(exponential, 0.0, power)
 
 
-def _slope(x: Array, y: Array) -> tuple[Array, Array]:
+def _fit_slope(x: Array, y: Array) -> tuple[Array, Array]:
     """The slope of the straight line through points along the first axis, and the sum of squares that it leaves."""
     x, y = x - jnp.mean(x, axis=0, keepdims=True), y - jnp.mean(y, axis=0, keepdims=True)
     slope = jnp.sum(x * y, axis=0) / jnp.sum(x * x, axis=0)
     return slope, jnp.sum((y - slope[None] * x) ** 2, axis=0)
 
 
-def _horizon(
+def _find_horizon(
     time: Array, sensitivity: Array, limit: Array, exponential: Array, rate: Array, power: Array
 ) -> Float[Array, "*units"]:
     """When the sensitivity reaches its limit [s]: between two frames on a straight line of its logarithm, else by its law."""
-    grown, goal = _reached(sensitivity), jnp.log(limit)
+    grown, goal = _log_peak_sensitivity(sensitivity), jnp.log(limit)
     time = jnp.broadcast_to(time, grown.shape)
     over = grown >= goal[None]
     i = jnp.clip(jnp.argmax(over, axis=0), 1, len(time) - 1)[None]

@@ -13,28 +13,28 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from physjax.scene import Scene
-from physjax.study.inverse.shooting import Launch, Range, nearest
+from physjax.study.inverse.shooting import AimProblem, Launch, find_nearest_launch
 from physjax.vectors import dot, norm, scale
 
-CIRCLE, RINGS = 256, (24, 32)
+PLANE_DIRECTIONS, SPACE_RINGS_AND_DIRECTIONS = 256, (24, 32)
 """Directions of the fan: around the circle in the plane; in space on so many rings, so many on each."""
-FRAMES = 96
+FAN_STEPS = 96
 """Steps of a flight in the fan, growing with time."""
-CANDIDATES = 8
+REFINED_DIRECTIONS = 8
 """Best directions of the fan that are refined."""
 
 
-def find_bounced(
-    shots: Range, speed: Float[Array, "*lanes"], late: Bool[Array, ""], bounces: int
+def find_ricochet(
+    shots: AimProblem, speed: Float[Array, "*lanes"], late: Bool[Array, ""], bounces: int
 ) -> tuple[Launch, Bool[Array, "*lanes"]]:
     """The launch at a speed [m/s] that hits after so many bounces, the soonest or the latest, and whether it bounces so.
 
     Where none hits, the one that comes nearest. What lies between the directions of the fan may be overlooked.
     """
-    starts = _best_of_fan(shots, speed, bounces)
+    starts = _pick_launches(shots, speed, bounces)
     wanted = jnp.ones(speed.shape, bool)
-    launches, distance = lax.map(lambda start: nearest(shots, start, speed, wanted), starts)
-    right = lax.map(lambda launch: _touches(shots, launch), launches) == bounces
+    launches, distance = lax.map(lambda start: find_nearest_launch(shots, start, speed, wanted), starts)
+    right = lax.map(lambda launch: _count_impacts(shots, launch), launches) == bounces
     extent = speed[None] * launches.time
     near = float(jnp.finfo(extent.dtype).eps) ** 0.75 * extent
     hit = right & (distance <= jnp.maximum(near, jax.vmap(shots.rounding)(launches)))
@@ -43,73 +43,73 @@ def find_bounced(
     worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0)) + 1
     rank = jnp.where(hit, order, worst + jnp.where(right, distance, 1e6 + distance))
     chosen = jnp.argmin(jnp.where(jnp.isfinite(rank), rank, jnp.inf), axis=0)
-    return jax.tree.map(lambda leaf: _picked(leaf, chosen), (launches, right))
+    return jax.tree.map(lambda leaf: _pick_by_lane(leaf, chosen), (launches, right))
 
 
-def _touches(shots: Range, launch: Launch) -> Int[Array, "*lanes"]:
+def _count_impacts(shots: AimProblem, launch: Launch) -> Int[Array, "*lanes"]:
     """How many of the flight's steps have an impact in them, one at its very end not counted."""
     dt, number = launch.time / shots.steps, jnp.arange(shots.steps, dtype=jnp.int32)
 
     def step(carry, i):
         scene, count = carry
-        scene, touched, moved = _watched_step(scene, shots.method, i.astype(dt.dtype) * dt, dt)
+        scene, touched, moved = _step_and_detect_impact(scene, shots.method, i.astype(dt.dtype) * dt, dt)
         last = i == shots.steps - 1
         return (scene, count + jnp.where(last, moved, touched).astype(count.dtype)), None
 
-    begin = (shots.fired(launch.velocity), jnp.zeros(launch.time.shape, jnp.int32))
+    begin = (shots.with_launch_velocity(launch.velocity), jnp.zeros(launch.time.shape, jnp.int32))
     return lax.scan(step, begin, number)[0][1]
 
 
-def _watched_step(scene: Scene, method: Any, t: Array, dt: Array) -> tuple[Scene, Array, Array]:
+def _step_and_detect_impact(scene: Scene, method: Any, t: Array, dt: Array) -> tuple[Scene, Array, Array]:
     """A step, whether an impact changed where it leads, velocity included, and whether the position."""
-    after, free = scene.step(method, t, dt), scene.having(contacts=()).step(method, t, dt).state
+    after, free = scene.step(method, t, dt), scene.replace(contacts=()).step(method, t, dt).state
     rounding = float(jnp.finfo(free.dtype).eps) ** 0.5
     fast = jnp.maximum(norm(free.velocity), norm(scene.state.velocity))
     moved = norm(after.state.position - free.position) > rounding * fast * dt
     return after, moved | (norm(after.state.velocity - free.velocity) > rounding * fast), moved
 
 
-def _best_of_fan(shots: Range, speed: Array, bounces: int) -> Launch:
+def _pick_launches(shots: AimProblem, speed: Array, bounces: int) -> Launch:
     """The launches of the fan that come nearest, of all that do better than their neighbours; stacked in front."""
-    fan = _directions(shots.target.shape[-1], shots.scene.up, speed.dtype)
+    fan = _build_directions(shots.target.shape[-1], shots.scene.up, speed.dtype)
     shape = fan.shape[:2]
     launch = lambda direction: scale(speed, jnp.broadcast_to(direction, shots.target.shape))  # noqa: E731
     rows = fan.reshape(-1, fan.shape[-1])
-    distance, time = lax.map(lambda direction: _closest(shots, launch(direction), speed, bounces), rows)
+    distance, time = lax.map(lambda direction: _find_closest_approach(shots, launch(direction), speed, bounces), rows)
     grid = distance.reshape(*shape, *distance.shape[1:])
     edge = jnp.full((1, *grid.shape[1:]), jnp.inf, grid.dtype)
-    beside = [jnp.roll(grid, 1, axis=1), jnp.roll(grid, -1, axis=1)]
-    beside += [jnp.concatenate([edge, grid[:-1]]), jnp.concatenate([grid[1:], edge])]
+    neighbours = [jnp.roll(grid, 1, axis=1), jnp.roll(grid, -1, axis=1)]
+    neighbours += [jnp.concatenate([edge, grid[:-1]]), jnp.concatenate([grid[1:], edge])]
     lowest = jnp.isfinite(grid)
-    for neighbour in beside:
+    for neighbour in neighbours:
         lowest = lowest & (grid <= neighbour)
     # those that beat their neighbours first, then the others, so that there is always something to refine
     rank = jnp.where(lowest, grid, 1e6 + grid).reshape(distance.shape)
-    best = jnp.moveaxis(lax.top_k(-jnp.moveaxis(rank, 0, -1), CANDIDATES)[1], -1, 0)
+    best = jnp.moveaxis(lax.top_k(-jnp.moveaxis(rank, 0, -1), REFINED_DIRECTIONS)[1], -1, 0)
     velocity = jax.vmap(lambda chosen: scale(speed, rows[chosen]))(best)
-    return Launch(velocity, jax.vmap(lambda chosen: _picked(time, chosen))(best))
+    return Launch(velocity, jax.vmap(lambda chosen: _pick_by_lane(time, chosen))(best))
 
 
-def _directions(dim: int, up: int, dtype: Any) -> Float[Array, "up around dim"]:
+def _build_directions(dim: int, up: int, dtype: Any) -> Float[Array, "up around dim"]:
     """Unit vectors, evenly around a circle, or on rings from nearly straight down to nearly straight up."""
     around = lambda count: 2 * math.pi / count * (jnp.arange(count, dtype=dtype) + 0.5)  # noqa: E731
     if dim == 2:
-        return jnp.stack([jnp.cos(around(CIRCLE)), jnp.sin(around(CIRCLE))], axis=-1)[None]
-    rise, turn = 0.5 * (around(RINGS[0]) - math.pi), around(RINGS[1])
+        return jnp.stack([jnp.cos(around(PLANE_DIRECTIONS)), jnp.sin(around(PLANE_DIRECTIONS))], axis=-1)[None]
+    rise, turn = 0.5 * (around(SPACE_RINGS_AND_DIRECTIONS[0]) - math.pi), around(SPACE_RINGS_AND_DIRECTIONS[1])
     rise, turn = jnp.meshgrid(rise, turn, indexing="ij")
     level = [jnp.cos(rise) * jnp.cos(turn), jnp.cos(rise) * jnp.sin(turn)]
     return jnp.stack([*level[:up], jnp.sin(rise), *level[up:]], axis=-1)
 
 
-def _closest(shots: Range, velocity: Array, speed: Array, bounces: int) -> tuple[Array, Array]:
+def _find_closest_approach(shots: AimProblem, velocity: Array, speed: Array, bounces: int) -> tuple[Array, Array]:
     """How near a shot comes while it has bounced so many times [m], and when [s]: chord by chord."""
-    first, growth = _clock(shots, speed, bounces)
+    first, growth = _choose_time_grid(shots, speed, bounces)
 
     def step(carry, i):
         scene, count, t, best, when = carry
         after = first * growth**i
         dt, x = after - t, scene.state.position
-        scene, touched, _ = _watched_step(scene, shots.method, t, dt)
+        scene, touched, _ = _step_and_detect_impact(scene, shots.method, t, dt)
         chord = scene.state.position - x
         length = dot(chord, chord)
         share = jnp.clip(dot(shots.target - x, chord) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
@@ -119,25 +119,25 @@ def _closest(shots: Range, velocity: Array, speed: Array, bounces: int) -> tuple
         return (scene, count + touched.astype(count.dtype), after, best, when), None
 
     still = jnp.zeros_like(speed)
-    begin = (shots.fired(velocity), jnp.zeros(still.shape, jnp.int32), still, still + jnp.inf, first)
-    (*_, best, when), _ = lax.scan(step, begin, jnp.arange(FRAMES, dtype=speed.dtype))
+    begin = (shots.with_launch_velocity(velocity), jnp.zeros(still.shape, jnp.int32), still, still + jnp.inf, first)
+    (*_, best, when), _ = lax.scan(step, begin, jnp.arange(FAN_STEPS, dtype=speed.dtype))
     return best, when
 
 
-def _clock(shots: Range, speed: Array, bounces: int) -> tuple[Array, Array]:
+def _choose_time_grid(shots: AimProblem, speed: Array, bounces: int) -> tuple[Array, Array]:
     """The first moment of a fan's flight [s], and the ratio of each to the one before.
 
     The last is as late as flights at this speed can be without drag, from bounce to bounce.
     """
-    distance, pull = norm(shots.offset), norm(shots.pull)
+    distance, rest_acceleration = norm(shots.offset), norm(shots.rest_acceleration)
     first = distance / (8 * speed)
     idle = 16 * (bounces + 1) * distance / speed
-    arcs = (bounces + 1) * (2 * speed / jnp.where(pull > 0, pull, 1.0)) + 2 * distance / speed
-    last = jnp.where(pull > 0, jnp.maximum(arcs, idle / 4), idle)
-    return first, (last / first) ** (1 / (FRAMES - 1))
+    arcs = (bounces + 1) * (2 * speed / jnp.where(rest_acceleration > 0, rest_acceleration, 1.0)) + 2 * distance / speed
+    last = jnp.where(rest_acceleration > 0, jnp.maximum(arcs, idle / 4), idle)
+    return first, (last / first) ** (1 / (FAN_STEPS - 1))
 
 
-def _picked(leaves: Array, chosen: Array) -> Array:
+def _pick_by_lane(leaves: Array, chosen: Array) -> Array:
     """From arrays stacked in front, lane by lane the chosen one."""
     index = chosen.reshape((1,) + chosen.shape + (1,) * (leaves.ndim - 1 - chosen.ndim))
     return jnp.take_along_axis(leaves, index, axis=0)[0]

@@ -17,21 +17,21 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import any_lane, loop, on_flagged
+from physjax.backend import any_lane, bounded_while_loop, compact_and_apply
 from physjax.loops import RECORD
 from physjax.particles import Particles
 from physjax.scene import Scene
-from physjax.stepping.simulate import sample, simulate
+from physjax.stepping.simulate import sample_states, simulate
 from physjax.trajectory import Trajectory
-from physjax.vectors import components, cross, dot, norm, scale, stacked, turn_left, unit
+from physjax.vectors import components, cross, dot, norm, scale, stack_components, turn_left, unit
 
-MOST, MOST_DOWNHILL = 40, 100
+MAX_SEARCH_STEPS, MAX_DESCENT_STEPS = 40, 100
 """Steps of a search, and of a descent to the nearest miss, after which it is given up."""
-COARSE = 16
+COARSE_STEPS = 16
 """Steps of a flight while the shot is still far from its target."""
-ROUNDINGS = 512
+HIT_ROUNDINGS = 512
 """A target that is missed by no more than so many roundings of the flight's extent is hit."""
-FARTHEST = math.e
+MAX_TIME_FACTOR = math.e
 """A search changes the flight time by no more than this factor at once."""
 
 
@@ -42,7 +42,7 @@ class Launch(NamedTuple):
     time: Float[Array, "*lanes"]
 
 
-class Range(eqx.Module):
+class AimProblem(eqx.Module):
     """Where shots are fired: a scene with a lane for every target [m], the method of the flights and their steps."""
 
     scene: Scene = eqx.field(metadata=RECORD)
@@ -56,12 +56,12 @@ class Range(eqx.Module):
         return self.target - self.scene.state.position
 
     @property
-    def pull(self) -> Float[Array, "*lanes dim"]:
+    def rest_acceleration(self) -> Float[Array, "*lanes dim"]:
         """The acceleration of a lane at rest at the launch [m/s²]."""
         position = self.scene.state.position
         return self.scene.acceleration(0.0, Particles(position, jnp.zeros_like(position)))
 
-    def fired(self, velocity: Float[Array, "*lanes dim"]) -> Scene:
+    def with_launch_velocity(self, velocity: Float[Array, "*lanes dim"]) -> Scene:
         """The scene with these launch velocities [m/s]."""
         scene = self.scene
         return Scene(Particles(scene.state.position, velocity), scene.mass, scene.forces, scene.contacts)
@@ -69,7 +69,7 @@ class Range(eqx.Module):
     def flight(self, launch: Launch, *, save_every: int | None = None, record: Any = None) -> Trajectory:
         """The flight in equal steps that end at its time; only its ends are kept unless told otherwise."""
         dt, steps = launch.time / self.steps, self.steps
-        scene = self.fired(launch.velocity)
+        scene = self.with_launch_velocity(launch.velocity)
         return simulate(scene, self.method, dt=dt, steps=steps, save_every=save_every or steps, record=record)
 
     def miss(self, launch: Launch, steps: Array | None = None) -> Float[Array, "*lanes dim"]:
@@ -80,7 +80,10 @@ class Range(eqx.Module):
         if steps is None:
             return self.flight(launch).final_scene.state.position - self.target
         dt = launch.time / steps.astype(launch.time.dtype)
-        return sample(self.fired(launch.velocity), self.method, dt, steps, 1).position[1] - self.target
+        return (
+            sample_states(self.with_launch_velocity(launch.velocity), self.method, dt, steps, 1).position[1]
+            - self.target
+        )
 
     def rounding(self, launch: Launch) -> Float[Array, "*lanes"]:
         """What rounding leaves of a miss [m]: of the flight's extent and, far from the origin, of a place at every step.
@@ -90,7 +93,7 @@ class Range(eqx.Module):
         extent = norm(self.offset) + norm(launch.velocity) * launch.time
         away = jnp.maximum(norm(self.scene.state.position), norm(self.target))
         eps = float(jnp.finfo(extent.dtype).eps)
-        left = eps * jnp.maximum(ROUNDINGS * extent, self.steps * away)
+        left = eps * jnp.maximum(HIT_ROUNDINGS * extent, self.steps * away)
         return lax.stop_gradient(jnp.minimum(left, eps**0.5 * extent))
 
     def sensitivity(self, launch: Launch, directions: list[Launch], steps: Array | None) -> tuple[Array, list[Array]]:
@@ -100,116 +103,118 @@ class Range(eqx.Module):
         miss, slopes = jax.vmap(along, out_axes=(None, 0))(many)
         return miss, list(slopes)
 
-    def following(self, launch: Launch, steps: Array | None = None) -> tuple[Array, Array]:
+    def newton_correction(self, launch: Launch, steps: Array | None = None) -> tuple[Array, Array]:
         """How far the velocity is from the one that is at the target at this time, and dv/d(log T) of that one [m/s]."""
         v, time = launch
         axes = [jnp.broadcast_to(row, v.shape) for row in jnp.eye(v.shape[-1], dtype=v.dtype)]
         directions = [Launch(axis, jnp.zeros_like(time)) for axis in axes] + [Launch(jnp.zeros_like(v), time)]
         miss, (*by_velocity, by_time) = self.sensitivity(launch, directions, steps)
-        return solved(by_velocity, miss), -solved(by_velocity, by_time)
+        return solve_columns(by_velocity, miss), -solve_columns(by_velocity, by_time)
 
 
 class _Search(NamedTuple):
     """Where the search for each lane is, what it last did (log of time: missing and moved), and whether it goes on."""
 
     launch: Launch
-    missing: Array
-    moved: Array
-    going: Bool[Array, "*lanes"]
+    log_time_error: Array
+    log_time_step: Array
+    active: Bool[Array, "*lanes"]
 
 
-def first_guess(shots: Range, speed: Float[Array, "*lanes"] | None) -> Launch:
+def guess_launch(shots: AimProblem, speed: Float[Array, "*lanes"] | None) -> Launch:
     """The launch in the valley as if the acceleration at rest stayed: T = √(2|Δ|/a), v = Δ/T - ½aT, not above the speed."""
-    pull = shots.pull
-    distance, strength = norm(shots.offset), norm(pull)
+    rest_acceleration = shots.rest_acceleration
+    distance, strength = norm(shots.offset), norm(rest_acceleration)
     pulled = strength > 0
     idle = distance if speed is None else distance / speed
     time = jnp.where(pulled, jnp.sqrt(2 * distance / jnp.where(pulled, strength, 1.0)), idle)
-    velocity = scale(1 / time, shots.offset) - scale(0.5 * time, pull)
+    velocity = scale(1 / time, shots.offset) - scale(0.5 * time, rest_acceleration)
     if speed is not None:
         velocity = scale(jnp.minimum(1.0, speed / norm(velocity)), velocity)
     return Launch(velocity, time)
 
 
-def find(
-    shots: Range, speed: Float[Array, "*lanes"] | None, late: Bool[Array, ""] | None
+def find_launch(
+    shots: AimProblem, speed: Float[Array, "*lanes"] | None, late: Bool[Array, ""] | None
 ) -> tuple[Launch, Bool[Array, "*lanes"]]:
     """The launch that hits at a speed [m/s], on the low arc or the `late` one, and whether it was found.
 
     Without a speed, the one that hits at the least. A lane whose target is out of reach comes to lie in the valley, with
     the least speed that would do. Flights of few steps lead near, those of all steps to the end.
     """
-    guess = first_guess(shots, speed)
+    guess = guess_launch(shots, speed)
     # a step from so near leads to the last digits where convergence is quadratic
     enough = float(jnp.finfo(guess.time.dtype).eps) ** (0.5 if speed is not None else 0.75)
-    steps = jnp.array([min(COARSE, shots.steps), shots.steps], jnp.int32)
+    steps = jnp.array([min(COARSE_STEPS, shots.steps), shots.steps], jnp.int32)
     phases = (steps, jnp.array([1e-3, enough], guess.time.dtype))
 
     def phase(search, precision):
         sound = jnp.isfinite(search.launch.time) & jnp.isfinite(norm(search.launch.velocity))
         search = search._replace(
-            launch=chosen(sound, search.launch, guess),
-            going=jnp.ones_like(search.going),
+            launch=select_where(sound, search.launch, guess),
+            active=jnp.ones_like(search.active),
         )
-        return _repeated(partial(_closer, late, precision), search, shots, speed, MOST), None
+        return _iterate_lanes(partial(_advance_search, late, precision), search, shots, speed, MAX_SEARCH_STEPS), None
 
     nothing = jnp.zeros_like(guess.time)
     search, _ = lax.scan(phase, _Search(guess, nothing, nothing, nothing < 0), phases)
-    return search.launch, ~search.going
+    return search.launch, ~search.active
 
 
-def _closer(
-    late: Array | None, precision: tuple[Array, Array], search: _Search, shots: Range, speed: Array | None
+def _advance_search(
+    late: Array | None, precision: tuple[Array, Array], search: _Search, shots: AimProblem, speed: Array | None
 ) -> _Search:
     """A step of the search."""
     steps, enough = precision
-    launch, missing, correction = _next_launch(shots, search, speed, late, steps)
-    moved = jnp.log(launch.time / search.launch.time)
-    return _Search(launch, missing, moved, ~(jnp.maximum(jnp.abs(moved), correction) <= enough))
+    launch, log_time_error, correction = _estimate_launch(shots, search, speed, late, steps)
+    log_time_step = jnp.log(launch.time / search.launch.time)
+    return _Search(launch, log_time_error, log_time_step, ~(jnp.maximum(jnp.abs(log_time_step), correction) <= enough))
 
 
-def _repeated(closer: Callable, begin: Any, shots: Range, speed: Array | None, most: int) -> Any:
-    """`closer(search, shots, speed)` again and again for the lanes that are `going`: a few hard ones hold up no others."""
+def _iterate_lanes(closer: Callable, begin: Any, shots: AimProblem, speed: Array | None, most: int) -> Any:
+    """`closer(search, shots, speed)` again and again for the lanes that are `active`: a few hard ones hold up no others."""
     others = (shots, speed)
-    cut, masks = shots.scene.may_be_cut(), shots.scene.lane_mask(others)
+    cut, masks = shots.scene.may_be_cut(), shots.scene.build_lane_mask(others)
 
     def once(search, shots, speed):
         after = closer(search, shots, speed)
-        return chosen(search.going, after, search)
+        return select_where(search.active, after, search)
 
     def body(search):
-        return on_flagged(once, search.going, search, *others, masks=masks, cut=cut)
+        return compact_and_apply(once, search.active, search, *others, masks=masks, cut=cut)
 
-    return loop(lambda search: any_lane(search.going), body, begin, most=most)
+    return bounded_while_loop(lambda search: any_lane(search.active), body, begin, most=most)
 
 
-def _next_launch(
-    shots: Range, search: _Search, speed: Array | None, late: Array | None, steps: Array
+def _estimate_launch(
+    shots: AimProblem, search: _Search, speed: Array | None, late: Array | None, steps: Array
 ) -> tuple[Launch, Array, Array]:
     """The launch that would be right if v(T) were like a parabola's from here, what is missing, and the correction of v.
 
     With u = log T, v = A exp(-u) + B exp(u) has the value and slope found here; it is exact without drag.
     """
     v, time = search.launch
-    correction, turn = shots.following(search.launch, steps)
+    correction, turn = shots.newton_correction(search.launch, steps)
     size, most = norm(correction), 0.5 * (norm(v) + (norm(shots.offset) / time if speed is None else speed))
     v = v - scale(jnp.minimum(1.0, most / jnp.where(size > 0, size, 1.0)), correction)
     falling, rising = 0.5 * (v - turn), 0.5 * (v + turn)
     a, b, both = norm(falling), norm(rising), dot(falling, rising)
     if speed is None:
-        missing = 0.5 * jnp.log(a / b)
+        log_time_error = 0.5 * jnp.log(a / b)
         # the secant through this point and the last, since v(u) bends more with drag than without
         bends = jnp.where(
-            search.moved != 0, (search.missing - missing) / jnp.where(search.moved != 0, search.moved, 1), 1
+            search.log_time_step != 0,
+            (search.log_time_error - log_time_error) / jnp.where(search.log_time_step != 0, search.log_time_step, 1),
+            1,
         )
-        change = missing / jnp.clip(bends, 0.3, 10.0)
+        change = log_time_error / jnp.clip(bends, 0.3, 10.0)
     else:
         middle = jnp.maximum(speed * speed - 2 * both, 2 * a * b)
         total = middle + jnp.sqrt((middle - 2 * a * b) * (middle + 2 * a * b))
-        change = missing = 0.5 * jnp.log(jnp.where(late, total / (2 * b * b), 2 * a * a / total))
-    factor = jnp.exp(jnp.clip(change, -math.log(FARTHEST), math.log(FARTHEST)))
+        change = log_time_error = 0.5 * jnp.log(jnp.where(late, total / (2 * b * b), 2 * a * a / total))
+    factor = jnp.exp(jnp.clip(change, -math.log(MAX_TIME_FACTOR), math.log(MAX_TIME_FACTOR)))
     launch = Launch(scale(1 / factor, falling) + scale(factor, rising), time * factor)
-    return launch, missing, size / jnp.maximum(most, norm(v))
+    return launch, log_time_error, size / jnp.maximum(most, norm(v))
 
 
 class _Descent(NamedTuple):
@@ -220,11 +225,11 @@ class _Descent(NamedTuple):
     miss: Float[Array, "*lanes dim"]
     slopes: tuple[Array, ...]
     damping: Array
-    going: Bool[Array, "*lanes"]
+    active: Bool[Array, "*lanes"]
 
 
-def nearest(
-    shots: Range, start: Launch, speed: Float[Array, "*lanes"], wanted: Bool[Array, "*lanes"]
+def find_nearest_launch(
+    shots: AimProblem, start: Launch, speed: Float[Array, "*lanes"], wanted: Bool[Array, "*lanes"]
 ) -> tuple[Launch, Float[Array, "*lanes"]]:
     """The launch that comes nearest the target, from a start on, at a speed, and its distance [m].
 
@@ -236,44 +241,46 @@ def nearest(
     steps, least = jnp.array(shots.steps, jnp.int32), 0.1 * float(jnp.finfo(still.dtype).eps) ** 0.5
 
     def closer(now, shots, speed):
-        step = [jnp.clip(part, -0.5, 0.5) for part in components(_damped(now.slopes, now.miss, now.damping))]
-        aside = sum(scale(angle, turn) for angle, turn in zip(step, tangents(now.launch.velocity), strict=False))
+        step = [jnp.clip(part, -0.5, 0.5) for part in components(_solve_damped_step(now.slopes, now.miss, now.damping))]
+        aside = sum(
+            scale(angle, turn) for angle, turn in zip(step, perpendicular_axes(now.launch.velocity), strict=False)
+        )
         velocity = scale(speed, unit(unit(now.launch.velocity) + aside))
         tried = Launch(velocity, now.launch.time * jnp.exp(step[-1]))
         still, zero = jnp.zeros_like(tried.time), jnp.zeros_like(velocity)
-        directions = [Launch(scale(speed, turn), still) for turn in tangents(velocity)]
+        directions = [Launch(scale(speed, turn), still) for turn in perpendicular_axes(velocity)]
         miss, slopes = shots.sensitivity(tried, [*directions, Launch(zero, tried.time)], steps)
         better = norm(miss) < now.distance
-        small = (norm(stacked(step)) <= least) & jnp.isfinite(now.distance)
+        small = (norm(stack_components(step)) <= least) & jnp.isfinite(now.distance)
         # a damped step leaves a share of the miss; the distance of a nearest miss stays, that of a hit goes on falling
         falls = norm(miss) < 0.5 * now.distance
-        after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.going)
+        after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.active)
         worse = now._replace(damping=3.0 * now.damping)
-        after = chosen(better, after, worse)
-        return after._replace(going=~(small & ~falls) & (after.damping < 1e8))
+        after = select_where(better, after, worse)
+        return after._replace(active=~(small & ~falls) & (after.damping < 1e8))
 
     # the first step is none at all, and finds the slopes
     axes = tuple(jnp.broadcast_to(row, zero.shape) for row in jnp.eye(zero.shape[-1], dtype=zero.dtype))
     start = Launch(scale(speed, unit(start.velocity)), start.time)
     begin = _Descent(start, still + jnp.inf, zero, axes, still + 1e-2, wanted)
-    end = _repeated(closer, begin, shots, speed, MOST_DOWNHILL)
+    end = _iterate_lanes(closer, begin, shots, speed, MAX_DESCENT_STEPS)
     return end.launch, end.distance
 
 
-def _damped(slopes: tuple[Array, ...], miss: Array, damping: Array) -> Array:
+def _solve_damped_step(slopes: tuple[Array, ...], miss: Array, damping: Array) -> Array:
     """The damped Gauss-Newton step: (JᵀJ + λ max(JᵀJ)) δ = -Jᵀr."""
     squares = [dot(slope, slope) for slope in slopes]
     largest = squares[0]
     for square in squares[1:]:
         largest = jnp.maximum(largest, square)
     normal = [
-        stacked([dot(a, b) + (damping * largest if i == j else 0.0) for i, a in enumerate(slopes)])
+        stack_components([dot(a, b) + (damping * largest if i == j else 0.0) for i, a in enumerate(slopes)])
         for j, b in enumerate(slopes)
     ]
-    return -solved(normal, stacked([dot(slope, miss) for slope in slopes]))
+    return -solve_columns(normal, stack_components([dot(slope, miss) for slope in slopes]))
 
 
-def tangents(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes dim"]]:
+def perpendicular_axes(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes dim"]]:
     """Unit vectors across a velocity: one in the plane, two in space."""
     along = unit(velocity)
     if velocity.shape[-1] == 2:
@@ -281,12 +288,14 @@ def tangents(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes 
     # across the axis that it follows least, so that the product is far from zero
     x, y, z = (jnp.abs(part) for part in components(along))
     least_x, least_y = (x <= y) & (x <= z), y <= z
-    axis = stacked([part.astype(x.dtype) for part in (least_x, ~least_x & least_y, ~least_x & ~least_y)])
+    axis = stack_components([part.astype(x.dtype) for part in (least_x, ~least_x & least_y, ~least_x & ~least_y)])
     first = unit(cross(along, axis))
     return [first, cross(along, first)]
 
 
-def solved(columns: list[Float[Array, "*lanes dim"]], b: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+def solve_columns(
+    columns: list[Float[Array, "*lanes dim"]], b: Float[Array, "*lanes dim"]
+) -> Float[Array, "*lanes dim"]:
     """The solution of Σ xᵢ columnᵢ = b, for each lane, in two or three dimensions: Cramer's rule."""
     if len(columns) == 2:
         p, q = columns
@@ -296,10 +305,10 @@ def solved(columns: list[Float[Array, "*lanes dim"]], b: Float[Array, "*lanes di
         p, q, r = columns
         around = cross(q, r)
         volumes, volume = [dot(b, around), dot(b, cross(r, p)), dot(b, cross(p, q))], dot(p, around)
-    return stacked([part / volume for part in volumes])
+    return stack_components([part / volume for part in volumes])
 
 
-def chosen(flag: Bool[Array, "*lanes"], new: Any, old: Any) -> Any:
+def select_where(flag: Bool[Array, "*lanes"], new: Any, old: Any) -> Any:
     """Lane by lane the new where flagged, else the old, for trees of numbers and vectors."""
     one = lambda a, b: jnp.where(flag if a.ndim == flag.ndim else flag[..., None], a, b)  # noqa: E731
     return jax.tree.map(one, new, old)

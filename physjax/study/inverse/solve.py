@@ -16,9 +16,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.checks import concrete, demand, positive_integer, real_array, real_quantity
+from physjax.checks import as_positive_integer, as_real_array, as_real_quantity, concrete_or_none, demand_all
 
-POLISH = 8
+MAX_NEWTON_STEPS = 8
 """Newton steps at most from where the safe search ended to the last digits."""
 
 
@@ -66,9 +66,9 @@ def solve(
     """
     import optimistix
 
-    box, start = _box("solve", guess, lower, upper)
-    rtol, atol = _tolerances(rtol, atol, start)
-    limits = {"max_steps": positive_integer("max_steps", max_steps), "throw": False}
+    box, start = _build_bounds("solve", guess, lower, upper)
+    rtol, atol = _choose_tolerances(rtol, atol, start)
+    limits = {"max_steps": as_positive_integer("max_steps", max_steps), "throw": False}
 
     def equations(inner, _):
         return ravel_pytree(residual(box.value(inner)))[0]
@@ -80,12 +80,12 @@ def solve(
             "say with minimise which of the many answers is wanted."
         )
     square = count == start.size
-    searched = _frozen(equations, start) if square else equations
+    searched = _stop_closure_gradients(equations, start) if square else equations
     safe = optimistix.LevenbergMarquardt(rtol, atol)
     found = optimistix.least_squares(searched, safe, start, **limits)
     if square:
         newton = optimistix.Newton(rtol, atol)
-        root = optimistix.root_find(equations, newton, found.value, max_steps=POLISH, throw=False).value
+        root = optimistix.root_find(equations, newton, found.value, max_steps=MAX_NEWTON_STEPS, throw=False).value
         left = lambda at: jnp.max(jnp.abs(searched(lax.stop_gradient(at), None)))  # noqa: E731
         vanishing = atol + rtol * left(start)
         # the derivatives are those of the Newton step: the search's would take second derivatives of the equations
@@ -118,8 +118,8 @@ def minimise(
     """
     import optimistix
 
-    box, start = _box("minimise", guess, lower, upper)
-    rtol, atol = _tolerances(rtol, atol, start)
+    box, start = _build_bounds("minimise", guess, lower, upper)
+    rtol, atol = _choose_tolerances(rtol, atol, start)
 
     def objective(inner, _):
         return cost(box.value(inner))
@@ -129,7 +129,7 @@ def minimise(
         raise ValueError(
             f"minimise: got a cost of {shape}, expected one number. Sum up, or use solve for least squares."
         )
-    limits = {"max_steps": positive_integer("max_steps", max_steps), "throw": False}
+    limits = {"max_steps": as_positive_integer("max_steps", max_steps), "throw": False}
     found = optimistix.minimise(objective, optimistix.BFGS(rtol, atol), start, **limits)
     value = box.value(found.value)
     least = cost(value)
@@ -137,13 +137,13 @@ def minimise(
     return Minimum(value, least, ok, found.stats["num_steps"])
 
 
-def _frozen(equations: Callable, start: Array) -> Callable:
+def _stop_closure_gradients(equations: Callable, start: Array) -> Callable:
     """The equations without derivatives in what they close over, so that none are carried through the search."""
     closed = eqx.filter_closure_convert(equations, start, None)
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, closed)
 
 
-class _Box(NamedTuple):
+class _Bounds(NamedTuple):
     """The value between its bounds as a smooth function of unbounded numbers, as in MINUIT, and back.
 
     Between two bounds a sine, above or below one a hyperbola that turns on it. Both reach the bound and turn back there,
@@ -153,54 +153,59 @@ class _Box(NamedTuple):
     lower: Array | None
     upper: Array | None
     unit: Array
-    shaped: Callable
+    unravel: Callable
 
     def value(self, inner: Array) -> Any:
         """The value for unbounded numbers."""
         if self.lower is None:
-            return self.shaped(inner)
-        low, high, both = self._ends()
+            return self.unravel(inner)
+        low, high, both = self._finite_bounds()
         between = low + 0.5 * (high - low) * (jnp.sin(inner) + 1)
         away = self.unit * (jnp.sqrt(inner * inner + 1) - 1)
         above, below = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        return self.shaped(jnp.where(both, between, jnp.where(above, low + away, jnp.where(below, high - away, inner))))
+        return self.unravel(
+            jnp.where(both, between, jnp.where(above, low + away, jnp.where(below, high - away, inner)))
+        )
 
     def inner(self, value: Array) -> Array:
         """The unbounded numbers of a flat value strictly between the bounds."""
         if self.lower is None:
             return value
-        low, high, both = self._ends()
+        low, high, both = self._finite_bounds()
         between = jnp.arcsin(jnp.clip(2 * (value - low) / (high - low) - 1, -1, 1))
         away = jnp.where(jnp.isfinite(self.lower), value - low, high - value) / self.unit + 1
         single = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
         hyperbola = jnp.sqrt(jnp.maximum(away * away - 1, 0))
         return jnp.where(both, between, jnp.where(single, hyperbola, value))
 
-    def _ends(self) -> tuple[Array, Array, Array]:
+    def _finite_bounds(self) -> tuple[Array, Array, Array]:
         """Finite stand-ins for both bounds, and where both are there."""
         low, high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         return jnp.where(low, self.lower, 0.0), jnp.where(high, self.upper, 1.0), low & high
 
 
-def _box(who: str, guess: Any, lower: Any, upper: Any) -> tuple[_Box, Array]:
+def _build_bounds(who: str, guess: Any, lower: Any, upper: Any) -> tuple[_Bounds, Array]:
     """The bounds, and the unbounded numbers to start from."""
-    guess = jax.tree.map(lambda leaf: real_quantity(f"{who}: guess", leaf), guess)
-    flat, shaped = ravel_pytree(guess)
+    guess = jax.tree.map(lambda leaf: as_real_quantity(f"{who}: guess", leaf), guess)
+    flat, unravel = ravel_pytree(guess)
     if not flat.size:
         raise ValueError(f"{who}: got an empty guess, expected at least one number.")
     if lower is None and upper is None:
-        return _Box(None, None, jnp.ones((), flat.dtype), shaped), flat
-    low, high = _bound(who, "lower", lower, guess, -jnp.inf), _bound(who, "upper", upper, guess, jnp.inf)
-    if all(concrete(array) is not None for array in (flat, low, high)):
-        inside = (concrete(low) < concrete(flat)) & (concrete(flat) < concrete(high))
-        demand(f"{who}: guess", flat, inside, "values strictly between lower and upper")
+        return _Bounds(None, None, jnp.ones((), flat.dtype), unravel), flat
+    low, high = (
+        _flatten_bound(who, "lower", lower, guess, -jnp.inf),
+        _flatten_bound(who, "upper", upper, guess, jnp.inf),
+    )
+    if all(concrete_or_none(array) is not None for array in (flat, low, high)):
+        inside = (concrete_or_none(low) < concrete_or_none(flat)) & (concrete_or_none(flat) < concrete_or_none(high))
+        demand_all(f"{who}: guess", flat, inside, "values strictly between lower and upper")
     middle = lax.stop_gradient(flat)
     unit = jnp.where(jnp.isfinite(low), middle - low, jnp.where(jnp.isfinite(high), high - middle, 1.0))
-    box = _Box(low, high, lax.stop_gradient(unit), shaped)
+    box = _Bounds(low, high, lax.stop_gradient(unit), unravel)
     return box, lax.stop_gradient(box.inner(flat))
 
 
-def _bound(who: str, name: str, bound: Any, guess: Any, absent: float) -> Array:
+def _flatten_bound(who: str, name: str, bound: Any, guess: Any, absent: float) -> Array:
     """A bound for every number of the guess, flat."""
     if bound is None:
         bound = absent
@@ -212,7 +217,7 @@ def _bound(who: str, name: str, bound: Any, guess: Any, absent: float) -> Array:
                 f"{who}: got {name}={bound!r}, expected a number or bounds in the same structure as the guess."
             )
         given = given * len(leaves)
-    arrays = [real_array(f"{who}: {name}", one).astype(leaf.dtype) for one, leaf in zip(given, leaves, strict=True)]
+    arrays = [as_real_array(f"{who}: {name}", one).astype(leaf.dtype) for one, leaf in zip(given, leaves, strict=True)]
     fitting = [a.shape in ((), leaf.shape) for a, leaf in zip(arrays, leaves, strict=True)]
     if not all(fitting):
         raise ValueError(
@@ -222,10 +227,10 @@ def _bound(who: str, name: str, bound: Any, guess: Any, absent: float) -> Array:
     return ravel_pytree([jnp.broadcast_to(a, leaf.shape) for a, leaf in zip(arrays, leaves, strict=True)])[0]
 
 
-def _tolerances(rtol: float | None, atol: float | None, start: Array) -> tuple[float, float]:
+def _choose_tolerances(rtol: float | None, atol: float | None, start: Array) -> tuple[float, float]:
     """Both tolerances, √eps unless given."""
     usual = float(jnp.finfo(start.dtype).eps) ** 0.5
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
         if tolerance is not None:
-            real_quantity(name, tolerance, above=0)
+            as_real_quantity(name, tolerance, above=0)
     return (usual if rtol is None else rtol), (usual if atol is None else atol)

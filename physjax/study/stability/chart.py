@@ -6,7 +6,7 @@ import numpy as np
 
 from physjax.show.style import style
 
-COLOURS = ("#CFE8D5", "#F6D98B", "#C9736A")
+VERDICT_COLOURS = ("#CFE8D5", "#F6D98B", "#C9736A")
 """Stable, inaccurate, diverged: told apart by their lightness as well."""
 
 
@@ -17,7 +17,7 @@ def draw_region(result: Any, ax: Any = None) -> Any:
     if ax is None:
         ax = plt.figure(figsize=(5, 5), layout="constrained").add_subplot()
     x, y = result.z.real, result.z.imag
-    ax.contourf(x, y, result.radius, levels=[0, 1 + 1e-9], colors=[COLOURS[0]])
+    ax.contourf(x, y, result.radius, levels=[0, 1 + 1e-9], colors=[VERDICT_COLOURS[0]])
     ax.contour(x, y, result.radius, levels=[1 + 1e-9], colors=[style(result.name)["color"]], linewidths=1.5)
     ax.axhline(0, color="0.7", linewidth=0.8)
     ax.axvline(0, color="0.7", linewidth=0.8)
@@ -41,14 +41,14 @@ def draw_stability_map(result: Any, figure: Any = None) -> Any:
         ax.set_visible(False)
     if swept:
         for i, ax in enumerate(panels[:count]):
-            _panel(ax, result.dts[i], result.values, result.verdict[i])
+            _draw_verdicts(ax, result.dts[i], result.values, result.verdict[i])
             ax.plot(result.predicted[i], result.values, color="black", linewidth=1.8, clip_on=True)
             ax.set(title=result.methods[i], ylabel=result.parameter)
             if result.values.min() > 0 and result.values.max() > 20 * result.values.min():
                 ax.set_yscale("log")
     else:
-        _strips(panels[0], result)
-    handles = [plt.Rectangle((0, 0), 1, 1, color=c) for c in COLOURS] + [
+        _draw_strips(panels[0], result)
+    handles = [plt.Rectangle((0, 0), 1, 1, color=c) for c in VERDICT_COLOURS] + [
         plt.Line2D([], [], color="black", linewidth=1.8)
     ]
     words = ("stable, error < 5 % of the way", "inaccurate", "diverged", "predicted limit")
@@ -56,19 +56,19 @@ def draw_stability_map(result: Any, figure: Any = None) -> Any:
     return figure
 
 
-def _panel(ax: Any, dts: np.ndarray, values: np.ndarray, verdict: np.ndarray) -> None:
+def _draw_verdicts(ax: Any, dts: np.ndarray, values: np.ndarray, verdict: np.ndarray) -> None:
     from matplotlib.colors import ListedColormap
 
     ax.set_xscale("log")
     rows = np.broadcast_to(values[:, None], dts.shape)
-    ax.pcolormesh(dts, rows, verdict, cmap=ListedColormap(COLOURS), vmin=-0.5, vmax=2.5, shading="nearest")
+    ax.pcolormesh(dts, rows, verdict, cmap=ListedColormap(VERDICT_COLOURS), vmin=-0.5, vmax=2.5, shading="nearest")
     ax.set(xlabel="dt [s]", xlim=(dts.min(), dts.max()))
 
 
-def _strips(ax: Any, result: Any) -> None:
+def _draw_strips(ax: Any, result: Any) -> None:
     """A row for each method, the first on top."""
     places = np.arange(len(result.methods))
-    _panel(ax, result.dts[:, 0], places, result.verdict[:, 0])
+    _draw_verdicts(ax, result.dts[:, 0], places, result.verdict[:, 0])
     for place, limit in zip(places, result.predicted[:, 0], strict=True):
         if result.dts.min() <= limit <= result.dts.max():
             ax.plot([limit, limit], [place - 0.5, place + 0.5], color="black", linewidth=2.2)

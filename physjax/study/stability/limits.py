@@ -11,26 +11,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.checks import real_quantity
+from physjax.checks import as_real_quantity
 from physjax.particles import Particles
 from physjax.parts import Force, as_module, force_name
 from physjax.physics.springs.springs import Springs
 from physjax.scene import Scene
 from physjax.stepping.registry import method_name
 from physjax.study.stability.linearisation import (
-    RESTING,
-    ROUNDING,
+    DRIFT_RATE_SHARE,
+    ROUNDING_RATE_SHARE,
     SmallMotion,
-    about,
     follows_rates,
-    radius,
+    linearise,
+    prepare_linearisation,
     rate_text,
-    small_motion,
+    spectral_radius,
     step_matrices,
 )
-from physjax.text import seconds_text
+from physjax.text import format_seconds
 
-SEEN = 1e-6
+GROWTH_TOLERANCE = 1e-6
 """Growth of a step matrix's eigenvalue that rounding, which splits the double ones, cannot feign."""
 
 
@@ -83,7 +83,7 @@ class Limit(NamedTuple):
             return f"{self.method}: any step is stable"
         where = "" if self.spring is None else f" (the spring between nodes {self.spring[0]} and {self.spring[1]})"
         what = f"set by the {self.cause} of {self.force}{where}, λ = {rate_text(self.rate)} 1/s"
-        return f"{self.method}: {seconds_text(self.dt) if self.dt else 'no step is stable'}, {what}"
+        return f"{self.method}: {format_seconds(self.dt) if self.dt else 'no step is stable'}, {what}"
 
 
 def region(
@@ -100,7 +100,7 @@ def region(
     """
     with jax.enable_x64(True):
         z = np.linspace(*real, points[0]) + 1j * np.linspace(*imaginary, points[1])[:, None]
-        return Region(method_name(method), z, np.asarray(radius(checked_method(method), jnp.asarray(z))))
+        return Region(method_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
 
 
 def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
@@ -115,17 +115,17 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
         (1.0, 'stiffness')
     """
     with jax.enable_x64(True):
-        scene, state = about(scene, at)
-        module, name = checked_method(method), method_name(method)
-        motion = small_motion(scene, state)
+        scene, state = prepare_linearisation(scene, at)
+        module, name = check_method(method), method_name(method)
+        motion = linearise(scene, state)
         fastest = np.abs(motion.rates()).max(axis=-1)
         if not np.any(fastest > 0):
             return Limit(name, np.inf, np.full(fastest.shape, np.inf), "nothing", "", None, (), 0j)
-        find = _limits_by_rates if motion.undamped or follows_rates(module) else _limits_by_steps
+        find = _find_limits_by_rates if motion.undamped or follows_rates(module) else _find_limits_by_steps
         each, worst_mode = find(module, motion, fastest)
         # where several blocks are as bad, or nothing sets a limit, the one that moves fastest speaks for all
         block = np.unravel_index(np.argmax(np.where(each == each.min(), fastest, -1.0)), each.shape)
-        return Limit(name, float(each[block]), each, *_blamed(scene, state, motion, block, worst_mode(block)))
+        return Limit(name, float(each[block]), each, *_attribute_mode(scene, state, motion, block, worst_mode(block)))
 
 
 def growth(scene: Scene, method: Callable, dt: Any, at: Particles | None = None) -> np.ndarray:
@@ -139,13 +139,13 @@ def growth(scene: Scene, method: Callable, dt: Any, at: Particles | None = None)
         2.0
     """
     with jax.enable_x64(True):
-        scene, state = about(scene, at)
-        motion, method = small_motion(scene, state), checked_method(method)
-        dt = np.broadcast_to(np.asarray(real_quantity("dt [s]", dt, above=0.0), float), scene.status_shape)
+        scene, state = prepare_linearisation(scene, at)
+        motion, method = linearise(scene, state), check_method(method)
+        dt = np.broadcast_to(np.asarray(as_real_quantity("dt [s]", dt, above=0.0), float), scene.status_shape)
         if motion.undamped or follows_rates(method):
-            z = _swinging(motion, method) * dt[..., None]
-            return np.asarray(radius(method, jnp.asarray(z))).max(axis=-1, initial=1.0)
-        return np.maximum(1.0, _growths(method, motion, dt, _without_own_growth(motion)).max(axis=-1))
+            z = _bounded_rates(motion, method) * dt[..., None]
+            return np.asarray(spectral_radius(method, jnp.asarray(z))).max(axis=-1, initial=1.0)
+        return np.maximum(1.0, _compute_growths(method, motion, dt, _build_growth_filter(motion)).max(axis=-1))
 
 
 def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
@@ -158,11 +158,11 @@ def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
         False
     """
     with jax.enable_x64(True):
-        rates = small_motion(*about(scene, at)).rates()
-        return rates.real.max(axis=-1) > RESTING * np.abs(rates).max(axis=-1)
+        rates = linearise(*prepare_linearisation(scene, at)).rates()
+        return rates.real.max(axis=-1) > DRIFT_RATE_SHARE * np.abs(rates).max(axis=-1)
 
 
-def checked_method(method: Callable) -> Any:
+def check_method(method: Callable) -> Any:
     """The method as part of a compiled function; a TypeError for what is none, or chooses its own steps."""
     if not callable(method):
         raise TypeError(f"stability: got the method {method!r}, expected one such as methods.rk4.")
@@ -171,7 +171,7 @@ def checked_method(method: Callable) -> Any:
     return as_module(method)
 
 
-def _swinging(motion: SmallMotion, method: Any) -> np.ndarray:
+def _bounded_rates(motion: SmallMotion, method: Any) -> np.ndarray:
     """Rates without those of drifts and of motions that grow by themselves, set to 0; rounding taken off undamped ones.
 
     Without damping a mode that grows has a partner that decays: a body that falls from a hilltop, and one that climbs it.
@@ -179,19 +179,19 @@ def _swinging(motion: SmallMotion, method: Any) -> np.ndarray:
     """
     rates = motion.rates()
     fastest = np.abs(rates).max(axis=-1, keepdims=True)
-    rates = np.where(np.abs(rates.real) < ROUNDING * fastest, 1j * rates.imag, rates)
-    gone = (np.abs(rates) < RESTING * fastest) | (rates.real > 0)
+    rates = np.where(np.abs(rates.real) < ROUNDING_RATE_SHARE * fastest, 1j * rates.imag, rates)
+    gone = (np.abs(rates) < DRIFT_RATE_SHARE * fastest) | (rates.real > 0)
     if motion.undamped and not follows_rates(method):
         gone |= rates.real != 0
     return np.where(gone, 0.0, rates)
 
 
-def _limits_by_rates(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
+def _find_limits_by_rates(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
     """The limit of each block where the rates decide: the first λ dt on its ray that leaves the region."""
-    swinging = _swinging(motion, method)
+    swinging = _bounded_rates(motion, method)
     speed = np.abs(swinging)
     directions = np.where(speed > 0, swinging / np.where(speed > 0, speed, 1.0), -1.0)
-    reach = _reach(method, directions)
+    reach = _find_reach(method, directions)
     limits = np.where(speed > 0, reach / np.where(speed > 0, speed, 1.0), np.inf)
 
     def worst_mode(block):
@@ -204,10 +204,10 @@ def _limits_by_rates(method: Any, motion: SmallMotion, fastest: np.ndarray) -> t
     return limits.min(axis=-1), worst_mode
 
 
-def _reach(method: Any, directions: np.ndarray) -> np.ndarray:
+def _find_reach(method: Any, directions: np.ndarray) -> np.ndarray:
     """How far from 0 each direction of the complex plane stays in the region; 0 if not at all, inf if beyond 100."""
     unique, back = np.unique(np.round(directions, 13), return_inverse=True)
-    inside = lambda s: np.asarray(radius(method, jnp.asarray(s * unique))) <= 1 + 1e-13  # noqa: E731
+    inside = lambda s: np.asarray(spectral_radius(method, jnp.asarray(s * unique))) <= 1 + 1e-13  # noqa: E731
     low, high, out = np.zeros(unique.shape), np.zeros(unique.shape), np.zeros(unique.shape, bool)
     for s in np.geomspace(1e-6, 100.0, 161):
         left = ~out & ~inside(s)
@@ -221,12 +221,12 @@ def _reach(method: Any, directions: np.ndarray) -> np.ndarray:
     return np.where(out, np.where(never, 0.0, low), np.inf)[back].reshape(directions.shape)
 
 
-def _limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
+def _find_limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> tuple:
     """The limit of each block by the eigenvalues of the step itself: doubled until one leaves 1, then halved."""
-    pace = np.where(fastest > 0, fastest, 1.0)
-    rates, rest = motion.rates(), _without_own_growth(motion)
-    grows = lambda dt: np.any(_growths(method, motion, dt, rest) > 1 + SEEN, axis=-1)  # noqa: E731
-    low, high, out = np.zeros(pace.shape), 0.01 / pace, np.zeros(pace.shape, bool)
+    fastest_rate = np.where(fastest > 0, fastest, 1.0)
+    rates, rest = motion.rates(), _build_growth_filter(motion)
+    grows = lambda dt: np.any(_compute_growths(method, motion, dt, rest) > 1 + GROWTH_TOLERANCE, axis=-1)  # noqa: E731
+    low, high, out = np.zeros(fastest_rate.shape), 0.01 / fastest_rate, np.zeros(fastest_rate.shape, bool)
     for _ in range(15):
         out = out | grows(high)
         low, high = np.where(out, low, high), np.where(out, high, 2 * high)
@@ -236,32 +236,32 @@ def _limits_by_steps(method: Any, motion: SmallMotion, fastest: np.ndarray) -> t
         middle = (low + high) / 2
         bad = grows(middle)
         low, high = np.where(bad, low, middle), np.where(bad, middle, high)
-    limits = np.where(out & (fastest > 0), np.where(low < 0.01 / pace, 0.0, low), np.inf)
+    limits = np.where(out & (fastest > 0), np.where(low < 0.01 / fastest_rate, 0.0, low), np.inf)
 
     def worst_mode(block):
         n = motion.stiffness.shape[-1]
-        dt = np.where(out, high * 1.01, 1 / pace)
-        μ, modes = np.linalg.eig(_matrices(method, motion, dt, rest)[block])
+        dt = np.where(out, high * 1.01, 1 / fastest_rate)
+        μ, modes = np.linalg.eig(_build_step_matrices(method, motion, dt, rest)[block])
         # of those that leave, the one that is furthest from what the scene does by itself
         strange = np.abs(μ[:, None] - np.exp(rates[block] * dt[block])).min(axis=-1)
-        leaves = np.abs(μ) > 1 + SEEN
+        leaves = np.abs(μ) > 1 + GROWTH_TOLERANCE
         mode = modes[:, np.argmax(np.where(leaves, 1 + strange, np.abs(μ) / np.abs(μ).max()))]
         return mode if out[block] else np.concatenate([mode[:n], mode[n:]])
 
     return limits, worst_mode
 
 
-def _without_own_growth(motion: SmallMotion) -> np.ndarray | None:
+def _build_growth_filter(motion: SmallMotion) -> np.ndarray | None:
     """What takes the part out of a motion that grows whatever the method, for each block; None where nothing grows.
 
     A step of what is left is the method's doing alone. To compare eigenvalues instead would need to know which of the
     step's belongs to which of the motion's, and a slow growth is soon lost among drifts.
     """
-    growing = motion.growing()
-    return None if growing is None else np.eye(growing.shape[-1]) - growing
+    growth_projector = motion.growth_projector()
+    return None if growth_projector is None else np.eye(growth_projector.shape[-1]) - growth_projector
 
 
-def _matrices(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
+def _build_step_matrices(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
     """The step's matrix of each block, of `rest` alone where there is such."""
     n = motion.stiffness.shape[-1]
     flat = [jnp.asarray(a.reshape(-1, n, n)) for a in motion[:2]]
@@ -270,20 +270,20 @@ def _matrices(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray
     return found if rest is None else rest @ found @ rest
 
 
-def _growths(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
+def _compute_growths(method: Any, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
     """The size of each eigenvalue of each block's step; the double 1 of a drift, which rounding splits, counts as 1."""
-    μ = np.linalg.eigvals(_matrices(method, motion, dt, rest))
+    μ = np.linalg.eigvals(_build_step_matrices(method, motion, dt, rest))
     return np.where(np.abs(μ - 1) < 1e-5, 1.0, np.abs(μ))
 
 
-def _blamed(scene: Scene, state: Particles, motion: SmallMotion, block: tuple, mode: np.ndarray) -> tuple:
+def _attribute_mode(scene: Scene, state: Particles, motion: SmallMotion, block: tuple, mode: np.ndarray) -> tuple:
     """Cause, force, spring, node and rate of a mode."""
     inner = motion.displacement(block, mode)
     shape = state.position.shape[len(block) :]
     weight = np.broadcast_to(np.sqrt(np.asarray(scene.mass))[..., None], state.position.shape)[block]
     moved = np.zeros(state.position.shape, complex)
     moved[block] = inner.reshape(shape) / weight
-    parts = [np.asarray(_shares(force, scene, state, jnp.asarray(moved))) for force in scene.forces]
+    parts = [np.asarray(_force_shares(force, scene, state, jnp.asarray(moved))) for force in scene.forces]
     stiffness, damping = np.sum(parts, axis=0)
     root = np.sqrt(complex(damping**2 / 4 - stiffness))
     rate = -damping / 2 - root
@@ -291,12 +291,12 @@ def _blamed(scene: Scene, state: Particles, motion: SmallMotion, block: tuple, m
     force = scene.forces[int(np.argmax([abs(part[kind]) for part in parts]))]
     size = np.sum(np.abs(moved) ** 2, axis=-1)
     node = tuple(int(i) for i in np.unravel_index(np.argmax(size), size.shape))
-    spring = _worst_spring(force, state, moved, kind, block) if isinstance(force, Springs) else None
+    spring = _find_worst_spring(force, state, moved, kind, block) if isinstance(force, Springs) else None
     return ("stiffness", "damping")[kind], force_name(force), spring, node, complex(rate)
 
 
 @jax.jit
-def _shares(force: Force, scene: Scene, state: Particles, moved: Any) -> Any:
+def _force_shares(force: Force, scene: Scene, state: Particles, moved: Any) -> Any:
     """What a force has in a mode's stiffness and damping: -d·∂F/∂x d and -d·∂F/∂v d."""
     held = 1.0 if scene.held is None else 1 - jnp.asarray(scene.held)[..., None].astype(state.dtype)
     still = jnp.zeros_like(state.position)
@@ -308,7 +308,9 @@ def _shares(force: Force, scene: Scene, state: Particles, moved: Any) -> Any:
     return total
 
 
-def _worst_spring(springs: Springs, state: Particles, moved: np.ndarray, kind: int, block: tuple) -> tuple[int, int]:
+def _find_worst_spring(
+    springs: Springs, state: Particles, moved: np.ndarray, kind: int, block: tuple
+) -> tuple[int, int]:
     """The spring that holds most of a mode's energy, or takes most of its power."""
     stretch = [
         np.asarray(

@@ -18,17 +18,17 @@ from jaxtyping import Array
 from physjax.particles import Particles, demand_particles
 from physjax.parts import Force
 from physjax.scene import Scene
-from physjax.stepping.reference import in_dtype
+from physjax.stepping.reference import cast_floats
 
-DENSE = 300
+MAX_DENSE_COORDINATES = 300
 """Coordinates of a scene up to which all its modes are found; of larger ones those that move fastest."""
-KRYLOV = 60
+KRYLOV_VECTORS = 60
 """Vectors for the fastest modes of stiffness and as many for damping."""
 
 
-RESTING = 1e-6
+DRIFT_RATE_SHARE = 1e-6
 """Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
-ROUNDING = 1e-9
+ROUNDING_RATE_SHARE = 1e-9
 """The real part, in parts of the fastest rate, that is none."""
 
 
@@ -51,7 +51,7 @@ class SmallMotion(NamedTuple):
         """Eigenvalues of one block and its modes as columns: positions above, velocities below."""
         return np.linalg.eig(self._rate_matrix()[block])
 
-    def growing(self, partners: bool = False) -> np.ndarray | None:
+    def growth_projector(self, partners: bool = False) -> np.ndarray | None:
         """What a motion has of those that grow by themselves, as matrices on (d, ḋ), `(*blocks, 2n, 2n)`; None without.
 
         Growth is e^(λt) however slow, but for drifts. The matrices are projections along all the other modes, so that
@@ -59,15 +59,19 @@ class SmallMotion(NamedTuple):
         another grows as well: the same displacements, without damping.
         """
         # in units in which both halves of the fastest motion are as large
-        fastest = self.pace()
-        pace = np.where(fastest > 0, fastest, 1.0)
-        unit = np.concatenate([np.broadcast_to(a, self.stiffness.shape[:-1]) for a in (pace[..., None], 1.0)], axis=-1)
+        fastest = self.fastest_rate()
+        fastest_rate = np.where(fastest > 0, fastest, 1.0)
+        unit = np.concatenate(
+            [np.broadcast_to(a, self.stiffness.shape[:-1]) for a in (fastest_rate[..., None], 1.0)], axis=-1
+        )
         scaled = self._rate_matrix() * unit[..., :, None] / unit[..., None, :]
         found = np.zeros_like(scaled)
         for block in np.ndindex(scaled.shape[:-2]):
             λ, right = np.linalg.eig(scaled[block])
             size = np.abs(λ.real) if partners else λ.real
-            grows = (size > ROUNDING * pace[block]) & (np.abs(λ) > RESTING * pace[block])
+            grows = (size > ROUNDING_RATE_SHARE * fastest_rate[block]) & (
+                np.abs(λ) > DRIFT_RATE_SHARE * fastest_rate[block]
+            )
             if not grows.any():
                 continue
             same, left = np.linalg.eig(scaled[block].T)
@@ -81,7 +85,7 @@ class SmallMotion(NamedTuple):
             found[block] = (right @ np.linalg.solve(left.T @ right, left.T)).real
         return found / unit[..., :, None] * unit[..., None, :] if found.any() else None
 
-    def pace(self) -> np.ndarray:
+    def fastest_rate(self) -> np.ndarray:
         """The fastest rate of each block [1/s]."""
         return np.abs(self.rates()).max(axis=-1)
 
@@ -104,11 +108,11 @@ class SmallMotion(NamedTuple):
         return np.block([[zero, one], [-self.stiffness, -self.damping]])
 
 
-def about(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
+def prepare_linearisation(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
     """A scene in float64 and the state about which its small motions are asked for: its own, if none is given."""
     if not isinstance(scene, Scene):
         raise TypeError(f"stability: got a {type(scene).__name__}, expected a Scene.")
-    scene = in_dtype(scene, jnp.float64)
+    scene = cast_floats(scene, jnp.float64)
     state = scene.state if at is None else Particles(*(jnp.asarray(a, jnp.float64) for a in at))
     if state.position.shape != scene.state.position.shape:
         raise ValueError(
@@ -117,25 +121,25 @@ def about(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
     return scene, state
 
 
-def small_motion(scene: Scene, state: Particles) -> SmallMotion:
+def linearise(scene: Scene, state: Particles) -> SmallMotion:
     """K and C of a scene about a state; held lanes do not move. Of large coupled scenes, their fastest modes."""
     demand_particles("small motions", state, "what turns is not linearised")
     inside = scene.state.lanes[-1:] if scene.couples else ()
     size = int(np.prod(inside)) * state.position.shape[-1]
-    if size <= DENSE:
-        stiffness, damping = _dense(scene, state, size)
+    if size <= MAX_DENSE_COORDINATES:
+        stiffness, damping = _build_dense_matrices(scene, state, size)
         return SmallMotion(np.asarray(stiffness), np.asarray(damping), None)
 
     def push(vector, which):
         pair = (vector, np.zeros_like(vector))
-        return np.asarray(_push(scene, state, *map(jnp.asarray, pair[::-1] if which else pair)))
+        return np.asarray(_apply_stiffness_and_damping(scene, state, *map(jnp.asarray, pair[::-1] if which else pair)))
 
     start = np.random.default_rng(0).normal(size=(*scene.status_shape, size))
     basis: list[np.ndarray] = []
     for which in (0, 1):
         vector, fresh = start, True
-        for _ in range(KRYLOV):
-            vector, fresh = _orthonormal(vector, basis)
+        for _ in range(KRYLOV_VECTORS):
+            vector, fresh = _orthonormalise(vector, basis)
             if not fresh:
                 break
             basis.append(vector)
@@ -145,7 +149,7 @@ def small_motion(scene: Scene, state: Particles) -> SmallMotion:
     return SmallMotion(project(0), project(1), rows)
 
 
-def _orthonormal(vector: np.ndarray, basis: list[np.ndarray]) -> tuple[np.ndarray, bool]:
+def _orthonormalise(vector: np.ndarray, basis: list[np.ndarray]) -> tuple[np.ndarray, bool]:
     """The part of a vector that the basis lacks, of length 1, and whether there is any."""
     before = np.linalg.norm(vector, axis=-1, keepdims=True)
     for _ in range(2):  # the first pass leaves rounding errors of the size of what it takes away
@@ -156,34 +160,34 @@ def _orthonormal(vector: np.ndarray, basis: list[np.ndarray]) -> tuple[np.ndarra
 
 
 @eqx.filter_jit
-def _push(scene: Scene, state: Particles, moved: Array, speed: Array) -> Array:
+def _apply_stiffness_and_damping(scene: Scene, state: Particles, moved: Array, speed: Array) -> Array:
     """K d + C ḋ for coordinates d and ḋ, `(*blocks, n)`."""
-    weight = weight_of(scene, state)
-    tangent = Particles(*(_free(scene, a.reshape(state.position.shape)) / weight for a in (moved, speed)))
+    weight = sqrt_mass(scene, state)
+    tangent = Particles(*(_zero_held(scene, a.reshape(state.position.shape)) / weight for a in (moved, speed)))
     change = jax.jvp(lambda s: scene.acceleration(jnp.zeros((), s.dtype), s), (state,), (tangent,))[1]
-    return -(weight * _free(scene, change)).reshape(moved.shape)
+    return -(weight * _zero_held(scene, change)).reshape(moved.shape)
 
 
 @eqx.filter_jit
-def _dense(scene: Scene, state: Particles, size: int) -> tuple[Array, Array]:
+def _build_dense_matrices(scene: Scene, state: Particles, size: int) -> tuple[Array, Array]:
     """K and C column by column."""
     blocks = scene.status_shape
     unit = jnp.eye(2 * size, dtype=state.dtype).reshape((2 * size, *(1,) * len(blocks), 2 * size))
     moved, speed = jnp.split(jnp.broadcast_to(unit, (2 * size, *blocks, 2 * size)), 2, axis=-1)
-    columns = jax.vmap(lambda moved, speed: _push(scene, state, moved, speed))(moved, speed)
+    columns = jax.vmap(lambda moved, speed: _apply_stiffness_and_damping(scene, state, moved, speed))(moved, speed)
     return tuple(jnp.moveaxis(a, 0, -1) for a in jnp.split(columns, 2))
 
 
-def weight_of(scene: Scene, state: Particles) -> Array:
+def sqrt_mass(scene: Scene, state: Particles) -> Array:
     """√m for each component of each lane: what makes a displacement a coordinate."""
     return jnp.broadcast_to(jnp.sqrt(scene.mass)[..., None], state.position.shape)
 
 
-def _free(scene: Scene, a: Array) -> Array:
+def _zero_held(scene: Scene, a: Array) -> Array:
     return a if scene.held is None else a * (1 - jnp.asarray(scene.held)[..., None].astype(a.dtype))
 
 
-class _Linear(Force):
+class _LinearForce(Force):
     """F = -(K x + C v)."""
 
     couples: ClassVar[bool] = True
@@ -201,7 +205,7 @@ def step_matrices(method: Callable, stiffness: Array, damping: Array, dt: Array)
     def matrix(stiffness, damping, dt):
         n = stiffness.shape[0]
         still = jnp.zeros((n, 1), stiffness.dtype)
-        scene = Scene(Particles(still, still), forces=(_Linear(stiffness, damping),))
+        scene = Scene(Particles(still, still), forces=(_LinearForce(stiffness, damping),))
 
         def column(y):
             after = method(scene, jnp.zeros((), y.dtype), Particles(y[:n, None], y[n:, None]), dt)
@@ -213,7 +217,7 @@ def step_matrices(method: Callable, stiffness: Array, damping: Array, dt: Array)
 
 
 @eqx.filter_jit
-def radius(method: Callable, z: Any) -> Array:
+def spectral_radius(method: Callable, z: Any) -> Array:
     """Spectral radius of one step of a method at z = λ dt, on x″ = −|λ|²x + 2Re(λ)x′, for complex numbers of any shape."""
     flat = jnp.ravel(z)
     stiffness, damping = (jnp.abs(flat) ** 2)[:, None, None], (-2 * flat.real)[:, None, None]

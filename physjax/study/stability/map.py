@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.checks import real_quantity
+from physjax.checks import as_real_quantity
 from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping import methods as ours
-from physjax.stepping.reference import in_dtype
+from physjax.stepping.reference import cast_floats
 from physjax.stepping.registry import method_name
-from physjax.stepping.simulate import sample
-from physjax.study.stability.limits import checked_method, limit
+from physjax.stepping.simulate import sample_states
+from physjax.study.stability.limits import check_method, limit
 
-FRAMES = 4
+JUDGED_FRAMES = 4
 """Moments at which a run is compared with the truth; every dt is rounded so that they are whole steps."""
-INACCURATE, DIVERGED = 0.05, 10.0
+INACCURATE_ERROR, DIVERGED_ERROR = 0.05, 10.0
 """Errors, in parts of the way that the scene goes, beyond which a run is called so."""
 VERDICTS = ("stable", "inaccurate", "diverged")
 
@@ -69,47 +69,51 @@ def map(
         [[[0, 2]]]
     """
     for method in methods:
-        checked_method(method)
-    dts = np.sort(np.asarray(real_quantity("dts [s]", dts, above=0.0), float).ravel())
+        check_method(method)
+    dts = np.sort(np.asarray(as_real_quantity("dts [s]", dts, above=0.0), float).ravel())
     name, values = ("", [0.0]) if parameter is None else parameter
-    values = np.asarray(real_quantity(f"values of {name}", values), float).ravel()
+    values = np.asarray(as_real_quantity(f"values of {name}", values), float).ravel()
     if callable(scene) == (parameter is None):
         raise TypeError(
             "map: got a scene and a parameter that do not fit. Give a Scene, or a function and (name, values)."
         )
-    duration = float(10 * FRAMES * dts[-1] if duration is None else real_quantity("duration [s]", duration, above=0.0))
+    duration = float(
+        10 * JUDGED_FRAMES * dts[-1] if duration is None else as_real_quantity("duration [s]", duration, above=0.0)
+    )
     with jax.enable_x64(True):
-        scenes = [in_dtype(scene(value) if parameter else scene, jnp.float64) for value in values]
+        scenes = [cast_floats(scene(value) if parameter else scene, jnp.float64) for value in values]
         predicted = np.array([[limit(s, method).dt for s in scenes] for method in methods])
-        counts = np.maximum(1, np.round(duration / FRAMES / dts)).astype(int)
-        truths = [_positions(s, ours.rk4, duration, _fine(s, counts, duration)) for s in scenes]
+        counts = np.maximum(1, np.round(duration / JUDGED_FRAMES / dts)).astype(int)
+        truths = [_sample_positions(s, ours.rk4, duration, _count_reference_steps(s, counts, duration)) for s in scenes]
         error = np.array(
             [
                 [
-                    [_error(_positions(s, m, duration, count), truth) for count in counts]
+                    [_measure_error(_sample_positions(s, m, duration, count), truth) for count in counts]
                     for s, truth in zip(scenes, truths, strict=True)
                 ]
                 for m in methods
             ]
         )
-    verdict = np.where(error <= INACCURATE, 0, np.where(error <= DIVERGED, 1, 2))
-    actual = np.broadcast_to(duration / FRAMES / counts, error.shape)
+    verdict = np.where(error <= INACCURATE_ERROR, 0, np.where(error <= DIVERGED_ERROR, 1, 2))
+    actual = np.broadcast_to(duration / JUDGED_FRAMES / counts, error.shape)
     names = tuple(method_name(method) for method in methods)
     return StabilityMap(names, name, values, actual, verdict, error, predicted, duration)
 
 
-def _fine(scene: Scene, counts: np.ndarray, duration: float) -> int:
+def _count_reference_steps(scene: Scene, counts: np.ndarray, duration: float) -> int:
     """Steps of rk4 in a frame for the truth: finer than any run, and a tenth of what is stable."""
     stable = limit(scene, ours.rk4).dt
-    return int(max(2 * counts.max(), np.ceil(10 * duration / FRAMES / stable) if 0 < stable < np.inf else 0))
+    return int(max(2 * counts.max(), np.ceil(10 * duration / JUDGED_FRAMES / stable) if 0 < stable < np.inf else 0))
 
 
-def _positions(scene: Scene, method: Callable, duration: float, count: int) -> np.ndarray:
-    dt = jnp.asarray(duration / FRAMES / count)
-    return np.asarray(sample(scene, as_module(method), dt, jnp.asarray(count, jnp.int32), FRAMES).position)
+def _sample_positions(scene: Scene, method: Callable, duration: float, count: int) -> np.ndarray:
+    dt = jnp.asarray(duration / JUDGED_FRAMES / count)
+    return np.asarray(
+        sample_states(scene, as_module(method), dt, jnp.asarray(count, jnp.int32), JUDGED_FRAMES).position
+    )
 
 
-def _error(positions: np.ndarray, truth: np.ndarray) -> float:
+def _measure_error(positions: np.ndarray, truth: np.ndarray) -> float:
     """The largest error in parts of the way gone (of the scene's size, if it rests); infinite for a run that blew up."""
     way = np.abs(truth - truth[0]).max()
     size = way if way > 1e-6 * np.abs(truth).max() else max(np.ptp(truth), 1e-300)

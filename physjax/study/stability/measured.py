@@ -17,18 +17,24 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.checks import positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.particles import Particles
 from physjax.parts import Force, as_module
 from physjax.scene import Scene
-from physjax.study.stability.linearisation import SmallMotion, about, follows_rates, small_motion, weight_of
+from physjax.study.stability.linearisation import (
+    SmallMotion,
+    follows_rates,
+    linearise,
+    prepare_linearisation,
+    sqrt_mass,
+)
 from physjax.vectors import scale
 
-SMALL = 1e-10
+DEVIATION_SIZE_SHARE = 1e-10
 """A deviation, in parts of the scene's size (or its way in the time of its fastest motion): far from rounding and curvature."""
-GREAT = 1e4
+ESCAPE_FACTOR = 1e4
 """What has grown by this has left the state it began at; it may well stop growing there."""
-BATCH = 16
+TRIAL_STEPS = 16
 """Steps tried at once; three rounds of them find a limit among five decades within 0.3 %."""
 
 
@@ -52,14 +58,14 @@ def measure_limit(
         1.0
     """
     with jax.enable_x64(True):
-        scene, state = about(scene, at)
-        bottom, top = _range(scene, state) if between is None else _checked_range(between, scene)
+        scene, state = prepare_linearisation(scene, at)
+        bottom, top = _choose_range(scene, state) if between is None else _check_range(between, scene)
         low, high = bottom, top
         for _ in range(3):
-            tried = np.geomspace(low, high, BATCH)
+            tried = np.geomspace(low, high, TRIAL_STEPS)
             bad = grows(scene, method, tried, state, steps=steps)
-            first = np.where(bad.any(axis=0), bad.argmax(axis=0), BATCH)
-            pick = lambda i: np.take_along_axis(tried, np.clip(i, 0, BATCH - 1)[None], axis=0)[0]  # noqa: E731, B023
+            first = np.where(bad.any(axis=0), bad.argmax(axis=0), TRIAL_STEPS)
+            pick = lambda i: np.take_along_axis(tried, np.clip(i, 0, TRIAL_STEPS - 1)[None], axis=0)[0]  # noqa: E731, B023
             low, high = pick(first - 1), pick(first)
         return np.where(high <= bottom, 0.0, np.where(low >= top, np.inf, low))
 
@@ -74,9 +80,9 @@ def grows(scene: Scene, method: Callable, dt: Any, at: Particles | None = None, 
         >>> [bool(stability.grows(swing, methods.verlet, dt, steps=200)) for dt in (0.8, 1.25)]
         [False, True]
     """
-    begin, early, late = _deviations(scene, method, dt, at, steps)
+    begin, early, late = _measure_deviations(scene, method, dt, at, steps)
     # what comes to rest elsewhere has left as well
-    return ~((late <= 1.5 * early) & (np.maximum(early, late) <= GREAT * begin))
+    return ~((late <= 1.5 * early) & (np.maximum(early, late) <= ESCAPE_FACTOR * begin))
 
 
 def measure_growth(
@@ -88,30 +94,30 @@ def measure_growth(
         >>> round(float(stability.measure_growth(swing, methods.euler, 0.5, steps=100)), 2)
         1.41
     """
-    _, early, late = _deviations(scene, method, dt, at, steps)
+    _, early, late = _measure_deviations(scene, method, dt, at, steps)
     with np.errstate(invalid="ignore"):
         return np.where(np.isfinite(late), (late / early) ** (2 / steps), np.inf)
 
 
-def _range(scene: Scene, state: Particles) -> tuple[np.ndarray, np.ndarray]:
-    pace = _pace(small_motion(scene, state))
-    return 1e-3 / pace, 1e2 / pace
+def _choose_range(scene: Scene, state: Particles) -> tuple[np.ndarray, np.ndarray]:
+    fastest_rate = _find_fastest_rate(linearise(scene, state))
+    return 1e-3 / fastest_rate, 1e2 / fastest_rate
 
 
-def _pace(motion: SmallMotion) -> np.ndarray:
+def _find_fastest_rate(motion: SmallMotion) -> np.ndarray:
     """The fastest rate of each scene [1/s]; 1 where nothing swings or decays."""
-    fastest = motion.pace()
+    fastest = motion.fastest_rate()
     return np.where(fastest > 0, fastest, 1.0)
 
 
-def _checked_range(between: Any, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    low, high = (float(real_quantity("between [s]", number, above=0.0)) for number in between)
+def _check_range(between: Any, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    low, high = (float(as_real_quantity("between [s]", number, above=0.0)) for number in between)
     if low >= high:
         raise ValueError(f"between [s]: got {low:g} and {high:g}, expected the smaller step first.")
     return np.full(scene.status_shape, low), np.full(scene.status_shape, high)
 
 
-class _Added(Force):
+class _DeviationForce(Force):
     """What a deviation from a state adds to the forces of a scene there."""
 
     scene: Scene
@@ -127,45 +133,50 @@ class _Added(Force):
         return scale(mass, self.scene.acceleration(now, there) - self.scene.acceleration(now, self.state))
 
 
-def _deviations(scene: Scene, method: Callable, dt: Any, at: Particles | None, steps: int) -> tuple[np.ndarray, ...]:
+def _measure_deviations(
+    scene: Scene, method: Callable, dt: Any, at: Particles | None, steps: int
+) -> tuple[np.ndarray, ...]:
     """The largest velocity of a deviation at the beginning, in the first and in the second half of a run."""
-    steps = positive_integer("steps", steps, at_least=64)
+    steps = as_positive_integer("steps", steps, at_least=64)
     with jax.enable_x64(True):
-        scene, state = about(scene, at)
-        dt = np.asarray(real_quantity("dt [s]", dt, above=0.0), float)
+        scene, state = prepare_linearisation(scene, at)
+        dt = np.asarray(as_real_quantity("dt [s]", dt, above=0.0), float)
         status = scene.status_shape
         leading = dt.shape[: dt.ndim - len(status)] if dt.ndim > len(status) else ()
         trials = np.broadcast_to(dt, (*leading, *status)).reshape((-1, *status))
-        motion = small_motion(scene, state)
+        motion = linearise(scene, state)
         method = as_module(method)
-        pace, growing = jnp.asarray(_pace(motion)), motion.growing(motion.undamped and not follows_rates(method))
-        own = None if growing is None else (growing, motion.basis)
-        found = _run(scene, state, method, pace, own, jnp.asarray(trials), steps)
+        fastest_rate, growth_projector = (
+            jnp.asarray(_find_fastest_rate(motion)),
+            motion.growth_projector(motion.undamped and not follows_rates(method)),
+        )
+        own = None if growth_projector is None else (growth_projector, motion.basis)
+        found = _run_deviations(scene, state, method, fastest_rate, own, jnp.asarray(trials), steps)
         return tuple(np.asarray(a).reshape((*leading, *status)) for a in found)
 
 
 @eqx.filter_jit
-def _run(
-    scene: Scene, state: Particles, method: Any, pace: Array, own: Any, dts: Array, steps: int
+def _run_deviations(
+    scene: Scene, state: Particles, method: Any, fastest_rate: Array, own: Any, dts: Array, steps: int
 ) -> tuple[Array, Array, Array]:
     x, v = state
-    reach = jnp.maximum(jnp.max(jnp.abs(x - jnp.mean(x))), jnp.max(jnp.abs(v)) / jnp.max(pace))
-    size = SMALL * jnp.maximum(reach, 1e-3)
+    reach = jnp.maximum(jnp.max(jnp.abs(x - jnp.mean(x))), jnp.max(jnp.abs(v)) / jnp.max(fastest_rate))
+    size = DEVIATION_SIZE_SHARE * jnp.maximum(reach, 1e-3)
     keys = jax.random.split(jax.random.key(0))
     push, speed = (size * jax.random.normal(key, x.shape, x.dtype) for key in keys)
     # pushed in both, in the proportion of the fastest mode: slower ones have then begun to move as well
-    start = Particles(push, scale(pace, speed))
+    start = Particles(push, scale(fastest_rate, speed))
     if scene.held is not None:
         start = jax.tree.map(lambda leaf: scale(1 - scene.held.astype(x.dtype), leaf), start)
-    rest = (lambda state: state) if own is None else partial(_without, own, scene)
+    rest = (lambda state: state) if own is None else partial(_remove_own_growth, own, scene)
     start = rest(start)
-    deviation = Scene(start, mass=scene.mass, forces=(_Added(scene, state),), pinned=scene.held)
+    deviation = Scene(start, mass=scene.mass, forces=(_DeviationForce(scene, state),), pinned=scene.held)
     inner = (-2, -1) if scene.couples else -1
 
     def run(dt):
         def step(i, carry):
             state, worst = carry
-            state = rest(deviation.having(state=state).step(method, i.astype(x.dtype) * dt, dt).state)
+            state = rest(deviation.replace(state=state).step(method, i.astype(x.dtype) * dt, dt).state)
             apart = jnp.max(jnp.abs(state.velocity), axis=inner)
             apart = jnp.where(jnp.isfinite(apart), apart, jnp.inf)
             spans = (i < 4, i < steps // 2, i >= steps // 2)
@@ -178,14 +189,14 @@ def _run(
     return jax.vmap(run)(dts)
 
 
-def _without(own: tuple, scene: Scene, state: Particles) -> Particles:
+def _remove_own_growth(own: tuple, scene: Scene, state: Particles) -> Particles:
     """A deviation less what it has of motions that grow by themselves."""
-    growing, basis = own
-    weight = weight_of(scene, state)
-    blocks = growing.shape[:-2]
+    growth_projector, basis = own
+    weight = sqrt_mass(scene, state)
+    blocks = growth_projector.shape[:-2]
     both = [(leaf * weight).reshape((*blocks, -1)) for leaf in state]
     seen = both if basis is None else [jnp.einsum("...ij,...j->...i", basis, a) for a in both]
-    grown = jnp.einsum("...ij,...j->...i", growing, jnp.concatenate(seen, axis=-1))
+    grown = jnp.einsum("...ij,...j->...i", growth_projector, jnp.concatenate(seen, axis=-1))
     parts = jnp.split(grown, 2, axis=-1)
     parts = parts if basis is None else [jnp.einsum("...ij,...i->...j", basis, a) for a in parts]
     return Particles(*(leaf - a.reshape(leaf.shape) / weight for leaf, a in zip(state, parts, strict=True)))

@@ -19,17 +19,17 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from physjax.stepping.blocks import BLOCK
-from physjax.stepping.simulate import WIDE
+from physjax.stepping.blocks import LANES_PER_BLOCK
+from physjax.stepping.simulate import WIDE_VECTOR_OPTIONS
 from physjax.study.sweeps.design import leaf_name
-from physjax.study.sweeps.fingerprint import host_calls, inside, lasting_digest
+from physjax.study.sweeps.fingerprint import find_host_calls, list_inner_jaxprs, persistent_digest
 from physjax.trajectory import Trajectory
 
-CARRIED = 64 * BLOCK
+MAX_CARRIED_BYTES = 64 * LANES_PER_BLOCK
 """Bytes of a block that a turn of a loop may hand on, to stay in a core's cache with the stages of a step."""
-LARGEST = 16 * BLOCK
+MAX_BATCH_LANES = 16 * LANES_PER_BLOCK
 """Lanes in a batch at most: more gain nothing, and a batch is what a kill loses and what progress is counted in."""
-VERDICTS = {
+FAILURE_TEXTS = {
     "Run": "blew up: the run's state is not finite at its end",
     "Solution": "not solved: the search ended without a root",
     "Minimum": "not solved: the search ended without a minimum",
@@ -49,11 +49,11 @@ class Run(NamedTuple):
     ok: Any
 
 
-class Traced(NamedTuple):
+class LaneProgram(NamedTuple):
     """A measure as a program for one lane: `jaxpr` from the leaves of a point to those of its values and a status.
 
     `values` is the tree of the values, with shapes and dtypes in its leaves; status k means `reasons[k]`, 0 is good.
-    `carried` and `peak` are the bytes that its loops carry, and that are alive at a time, at most. `digest` is a hash of
+    `carried_bytes` and `peak_bytes` are the bytes that its loops carry, and that are alive at a time, at most. `digest` is a hash of
     the program with the constants it closes over, `calls` what it calls outside of itself, which no hash of it tells.
     """
 
@@ -65,7 +65,7 @@ class Traced(NamedTuple):
 
     def __eq__(self, other: object) -> bool:
         # functions that are called back must be the very same: equal ones may close over arrays that change later
-        return isinstance(other, Traced) and self._key == other._key
+        return isinstance(other, LaneProgram) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
@@ -75,24 +75,24 @@ class Traced(NamedTuple):
         return (self.digest, *((kind, id(called)) for kind, called in self.calls))
 
     @property
-    def lasting_digest(self) -> str:
+    def persistent_digest(self) -> str:
         """A hash by which another process knows the same measure; ValueError where it calls what has none."""
-        return lasting_digest(self.digest, self.calls)
+        return persistent_digest(self.digest, self.calls)
 
     @property
-    def carried(self) -> int:
+    def carried_bytes(self) -> int:
         """Bytes that a turn of a loop hands on, at most; without loops all that is alive."""
-        return _most_carried(self.jaxpr.jaxpr) or self.peak
+        return _max_carried_bytes(self.jaxpr.jaxpr) or self.peak_bytes
 
     @property
-    def peak(self) -> int:
+    def peak_bytes(self) -> int:
         """Bytes alive at a time, at most, if nothing is fused."""
-        return max(1, _peak(self.jaxpr.jaxpr))
+        return max(1, _max_peak_bytes(self.jaxpr.jaxpr))
 
     @property
-    def passed(self) -> int:
+    def transferred_bytes(self) -> int:
         """Bytes that go in and come out."""
-        return _bytes(self.jaxpr.jaxpr.invars) + _bytes(self.jaxpr.jaxpr.outvars)
+        return _count_bytes(self.jaxpr.jaxpr.invars) + _count_bytes(self.jaxpr.jaxpr.outvars)
 
 
 class Layout(NamedTuple):
@@ -103,13 +103,13 @@ class Layout(NamedTuple):
     count: int
 
 
-def traced(measure: Callable, point: Any) -> Traced:
+def trace_measure(measure: Callable, point: Any) -> LaneProgram:
     """Trace a measure at a point, given as shapes and dtypes by name."""
     seen = []
 
     def lane(point):
-        values = jax.tree.map(jnp.asarray, _shown(measure(**point)))
-        reasons = _judged(values)
+        values = jax.tree.map(jnp.asarray, _strip_runs(measure(**point)))
+        reasons = _list_verdicts(values)
         status = jnp.zeros((), jnp.int16)
         for code in range(len(reasons), 0, -1):
             status = jnp.where(reasons[code - 1][1], status, jnp.int16(code))
@@ -120,16 +120,16 @@ def traced(measure: Callable, point: Any) -> Traced:
     try:
         jaxpr = jax.make_jaxpr(lambda *flat: jax.tree.leaves(lane(jax.tree.unflatten(tree, flat))))(*leaves)
     except TypeError as error:
-        raise TypeError(_untraceable(measure, point, error)) from error
+        raise TypeError(_trace_error_text(measure, point, error)) from error
     values, reasons = seen[-1]
     if not jax.tree.leaves(values):
-        raise ValueError(f"measure: {_name(measure)} returned {values!r}, expected at least one number.")
-    digest, calls = _digest(jaxpr, leaves)
-    return Traced(jaxpr, values, reasons, digest, calls)
+        raise ValueError(f"measure: {_measure_name(measure)} returned {values!r}, expected at least one number.")
+    digest, calls = _hash_program(jaxpr, leaves)
+    return LaneProgram(jaxpr, values, reasons, digest, calls)
 
 
-def layout(
-    program: Traced,
+def choose_layout(
+    program: LaneProgram,
     lanes: int,
     memory: int,
     devices: Sequence[Any],
@@ -140,7 +140,7 @@ def layout(
 
     `begun` are the lanes in a batch and in a block of such a sweep.
     """
-    needed = program.peak + program.passed
+    needed = program.peak_bytes + program.transferred_bytes
     if needed > memory:
         raise ValueError(
             f"memory: got {memory:,} bytes, expected at least {needed:,}, which one lane of the measure may take. Give more, "
@@ -151,11 +151,15 @@ def layout(
     else:
         share = math.ceil(min(lanes, batch or lanes) / len(devices))
         # a CPU is fastest in its cache, anything else with all that it can hold
-        best = min(CARRIED // program.carried, BLOCK) if devices[0].platform == "cpu" else LARGEST
-        fitting = min(best, memory // (2 * len(devices) * program.peak))
+        best = (
+            min(MAX_CARRIED_BYTES // program.carried_bytes, LANES_PER_BLOCK)
+            if devices[0].platform == "cpu"
+            else MAX_BATCH_LANES
+        )
+        fitting = min(best, memory // (2 * len(devices) * program.peak_bytes))
         size = min(share, 1 << max(0, fitting.bit_length() - 1))
-        left = memory - len(devices) * size * program.peak
-        most = max(size, min(LARGEST, left // (2 * program.passed)) // size * size)
+        left = memory - len(devices) * size * program.peak_bytes
+        most = max(size, min(MAX_BATCH_LANES, left // (2 * program.transferred_bytes)) // size * size)
         # batches of equal length in whole blocks
         batch = batch or math.ceil(lanes / math.ceil(lanes / most) / size) * size
         size = math.ceil(batch / math.ceil(batch / size))
@@ -163,7 +167,7 @@ def layout(
 
 
 @functools.lru_cache(maxsize=16)
-def compiled(program: Traced, cut: Layout, devices: tuple) -> Callable:
+def compile_batch(program: LaneProgram, cut: Layout, devices: tuple) -> Callable:
     """The batch as one executable: leaves `(count, size, ...)` of points to those of values, and status."""
     one = jax.vmap(jaxpr_as_fun(program.jaxpr))
 
@@ -178,50 +182,50 @@ def compiled(program: Traced, cut: Layout, devices: tuple) -> Callable:
         jax.ShapeDtypeStruct((cut.count, cut.size, *v.aval.shape), v.aval.dtype) for v in program.jaxpr.jaxpr.invars
     ]
     placed = NamedSharding(mesh, spec)
-    options = WIDE if devices[0].platform == "cpu" else None
+    options = WIDE_VECTOR_OPTIONS if devices[0].platform == "cpu" else None
     whole = jax.jit(batch, in_shardings=placed, out_shardings=placed, compiler_options=options)
     executable = whole.lower(*shapes).compile()
     return lambda *flat: executable(*jax.device_put(flat, placed))
 
 
-def _shown(outcome: Any) -> Any:
+def _strip_runs(outcome: Any) -> Any:
     """What is kept of a measure's outcome: runs leave their scene behind."""
     is_run = lambda node: isinstance(node, Trajectory)  # noqa: E731
     shorten = lambda node: Run(node.time, node.state, node.recorded, node.ok) if is_run(node) else node  # noqa: E731
     return jax.tree.map(shorten, outcome, is_leaf=is_run)
 
 
-def _judged(values: Any) -> list[tuple[str, Any]]:
+def _list_verdicts(values: Any) -> list[tuple[str, Any]]:
     """Reasons for which a lane may be bad, each with whether it is good: its own verdicts first, then its numbers."""
     judged = [
-        (f"{VERDICTS.get(type(node).__name__, 'not ok')}{_at(path)}", jnp.all(_ok(node)))
-        for path, node in _nodes(values)
-        if _ok(node) is not None
+        (f"{FAILURE_TEXTS.get(type(node).__name__, 'not ok')}{_format_path(path)}", jnp.all(_read_ok(node)))
+        for path, node in _list_nodes(values)
+        if _read_ok(node) is not None
     ]
     return judged + [
-        (f"not finite{_at(path)}", jnp.all(jnp.isfinite(leaf)))
+        (f"not finite{_format_path(path)}", jnp.all(jnp.isfinite(leaf)))
         for path, leaf in jax.tree_util.tree_leaves_with_path(values)
         if jnp.issubdtype(leaf.dtype, jnp.inexact)
     ]
 
 
-def _nodes(tree: Any, path: tuple = ()) -> list[tuple[tuple, Any]]:
+def _list_nodes(tree: Any, path: tuple = ()) -> list[tuple[tuple, Any]]:
     """Every node of a tree that is not a leaf, with its path, the outer ones first."""
     below = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: node is not tree)
     if len(below) == 1 and below[0][1] is tree:
         return []
-    return [(path, tree)] + [found for keys, child in below for found in _nodes(child, (*path, *keys))]
+    return [(path, tree)] + [found for keys, child in below for found in _list_nodes(child, (*path, *keys))]
 
 
-def _ok(node: Any) -> Any:
+def _read_ok(node: Any) -> Any:
     return node.get("ok") if isinstance(node, dict) else getattr(node, "ok", None)
 
 
-def _at(path: tuple) -> str:
+def _format_path(path: tuple) -> str:
     return f" (at {leaf_name(path)})" if path else ""
 
 
-def _digest(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
+def _hash_program(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
     """A hash of what is computed, with the constants that it closes over, whatever the code is called and looks like.
 
     And what the program calls outside of itself, of which its text has no more than a number.
@@ -232,65 +236,65 @@ def _digest(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
         if jnp.issubdtype(getattr(constant, "dtype", float), jax.dtypes.prng_key):
             constant = jax.random.key_data(constant)
         found.update(np.asarray(constant).tobytes())
-    calls = tuple(host_calls(jaxpr.jaxpr))
+    calls = tuple(find_host_calls(jaxpr.jaxpr))
     if not calls and "python" in text and "callback" in text:
         calls = (("unknown", None),)
     return found.hexdigest(), calls
 
 
-def _name(measure: Callable) -> str:
-    return getattr(_plain(measure), "__qualname__", type(measure).__name__)
+def _measure_name(measure: Callable) -> str:
+    return getattr(_unwrap_measure(measure), "__qualname__", type(measure).__name__)
 
 
-def _plain(measure: Any) -> Any:
+def _unwrap_measure(measure: Any) -> Any:
     """The user's own function inside partials and wrappers."""
     while isinstance(measure, functools.partial):
         measure = measure.func
     return inspect.unwrap(measure) if callable(measure) else measure
 
 
-def _untraceable(measure: Callable, point: Any, error: TypeError) -> str:
+def _trace_error_text(measure: Callable, point: Any, error: TypeError) -> str:
     """Which line of the measure cannot be traced, and why."""
-    plain = _plain(measure)
+    plain = _unwrap_measure(measure)
     code = getattr(plain if hasattr(plain, "__code__") else type(plain).__call__, "__code__", None)
     frames = traceback.extract_tb(error.__traceback__)
     here = [frame for frame in frames if code is not None and frame.filename == code.co_filename]
     reason = str(error).splitlines()[0]
     if not here:
-        return f"measure: {_name(measure)} cannot be called with {', '.join(point)}, one number each: {reason}"
+        return f"measure: {_measure_name(measure)} cannot be called with {', '.join(point)}, one number each: {reason}"
     line = here[-1]
     source = linecache.getline(line.filename, line.lineno).strip()
     return (
-        f"measure: {_name(measure)} cannot be traced at {line.filename}, line {line.lineno}: `{source}`. {reason} A sweep is one "
+        f"measure: {_measure_name(measure)} cannot be traced at {line.filename}, line {line.lineno}: `{source}`. {reason} A sweep is one "
         "compiled program for all lanes, in which a swept number has no single value: expected jnp functions, jnp.where "
         "and lax.cond instead of Python's branches and float(), and shapes and counts that no axis changes."
     )
 
 
-def _bytes(variables: Sequence[Any]) -> int:
+def _count_bytes(variables: Sequence[Any]) -> int:
     sized = [v.aval for v in variables if hasattr(v.aval, "shape")]
     return sum(math.prod(aval.shape) * getattr(aval.dtype, "itemsize", 8) for aval in sized)
 
 
-def _most_carried(jaxpr: Jaxpr) -> int:
+def _max_carried_bytes(jaxpr: Jaxpr) -> int:
     """Bytes that a turn of any loop hands on, at most: what it carries, and what it stacks."""
     most = 0
     for equation in jaxpr.eqns:
-        bodies = inside(equation)
+        bodies = list_inner_jaxprs(equation)
         loops = bodies if equation.primitive.name in ("scan", "while") else []
-        most = max([most, *(_bytes(body.outvars) for body in loops), *map(_most_carried, bodies)])
+        most = max([most, *(_count_bytes(body.outvars) for body in loops), *map(_max_carried_bytes, bodies)])
     return most
 
 
-def _peak(jaxpr: Jaxpr) -> int:
+def _max_peak_bytes(jaxpr: Jaxpr) -> int:
     """Bytes alive at a time, at most: of every operation its results, what is still to be used, and what it needs inside."""
     last = {v: i for i, equation in enumerate(jaxpr.eqns) for v in equation.invars if not isinstance(v, Literal)}
     kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
-    alive, most = _bytes(jaxpr.invars), 0
+    alive, most = _count_bytes(jaxpr.invars), 0
     for i, equation in enumerate(jaxpr.eqns):
-        alive += _bytes(equation.outvars)
-        most = max(most, alive + max(map(_peak, inside(equation)), default=0))
+        alive += _count_bytes(equation.outvars)
+        most = max(most, alive + max(map(_max_peak_bytes, list_inner_jaxprs(equation)), default=0))
         used = {v for v in equation.invars if not isinstance(v, Literal)}
-        alive -= _bytes([v for v in used if last[v] == i and v not in kept])
-        alive -= _bytes([v for v in equation.outvars if v not in last and v not in kept])
+        alive -= _count_bytes([v for v in used if last[v] == i and v not in kept])
+        alive -= _count_bytes([v for v in equation.outvars if v not in last and v not in kept])
     return max(most, alive)

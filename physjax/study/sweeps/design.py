@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.checks import known, positive_integer, real_quantity
+from physjax.checks import as_positive_integer, as_real_quantity, demand_known
 
 __all__ = ["Axis", "Lanes", "latin_hypercube", "sobol"]
 
@@ -90,12 +90,12 @@ class Lanes(NamedTuple):
         return {axis.name: axis.at(i) for axis, i in zip(self.axes, self.indices(lanes), strict=True)}
 
 
-def checked_lanes(axes: Any, design: str) -> Lanes:
+def build_lanes(axes: Any, design: str) -> Lanes:
     """The axes as arrays of the dtypes that JAX will compute in; ValueError or TypeError in plain words for bad ones."""
-    known("design", design, DESIGNS)
+    demand_known("design", design, DESIGNS)
     if not isinstance(axes, Mapping) or not axes:
         raise TypeError(f"axes: got {axes!r}, expected names and arrays, e.g. dict(speed=jnp.linspace(10, 50, 100)).")
-    lanes = Lanes(tuple(_axis(name, values) for name, values in axes.items()), design)
+    lanes = Lanes(tuple(_build_axis(name, values) for name, values in axes.items()), design)
     lengths = {axis.name: axis.length for axis in lanes.axes}
     if design == "zip" and len(set(lengths.values())) > 1:
         raise ValueError(
@@ -104,12 +104,12 @@ def checked_lanes(axes: Any, design: str) -> Lanes:
     return lanes
 
 
-def _axis(name: Any, values: Any) -> Axis:
+def _build_axis(name: Any, values: Any) -> Axis:
     if not isinstance(name, str) or not name.isidentifier():
         raise TypeError(f"axes: got the name {name!r}, expected the name of an argument of the measure.")
     if isinstance(values, Sequence) and not hasattr(values, "_fields") and len(values):
-        values = _stacked(name, list(values))
-    values = jax.tree.map(lambda leaf: _array(name, leaf), values)
+        values = _stack_records(name, list(values))
+    values = jax.tree.map(lambda leaf: _check_array(name, leaf), values)
     leaves = jax.tree.leaves(values)
     if not leaves or any(not leaf.ndim or not leaf.size for leaf in leaves):
         shapes = [leaf.shape for leaf in leaves]
@@ -124,14 +124,14 @@ def _axis(name: Any, values: Any) -> Axis:
     return Axis(name, values)
 
 
-def _array(name: str, leaf: Any) -> np.ndarray:
+def _check_array(name: str, leaf: Any) -> np.ndarray:
     array = np.asarray(leaf)
     if array.dtype.kind not in "biuf" and not jnp.issubdtype(array.dtype, jnp.floating):
         raise TypeError(f"axis {name}: got dtype {array.dtype}, expected real numbers, or records of them.")
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))
 
 
-def _stacked(name: str, values: list) -> Any:
+def _stack_records(name: str, values: list) -> Any:
     """Many records of the same shape, scenes for example, as one with a leading axis; others are refused with the reason."""
     # what is not a number stands in the structure, where it must be the same in all
     parts = [
@@ -171,7 +171,7 @@ def latin_hypercube(ranges: Mapping[str, tuple[float, float]], count: int, *, se
 
     M. D. McKay, R. J. Beckman, W. J. Conover, Technometrics 21 (1979) 239.
     """
-    return _sampled("LatinHypercube", ranges, count, seed)
+    return _sample_points("LatinHypercube", ranges, count, seed)
 
 
 def sobol(ranges: Mapping[str, tuple[float, float]], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
@@ -179,20 +179,22 @@ def sobol(ranges: Mapping[str, tuple[float, float]], count: int, *, seed: int = 
 
     I. M. Sobol, USSR Comput. Math. Math. Phys. 7 (1967) 86; scrambled after A. Owen (1998).
     """
-    if positive_integer("count", count).bit_count() != 1:
+    if as_positive_integer("count", count).bit_count() != 1:
         raise ValueError(
             f"count: got {count}, expected a power of two, e.g. {1 << count.bit_length()}: only such are balanced."
         )
-    return _sampled("Sobol", ranges, count, seed)
+    return _sample_points("Sobol", ranges, count, seed)
 
 
-def _sampled(kind: str, ranges: Mapping[str, tuple[float, float]], count: int, seed: int) -> dict[str, np.ndarray]:
+def _sample_points(
+    kind: str, ranges: Mapping[str, tuple[float, float]], count: int, seed: int
+) -> dict[str, np.ndarray]:
     try:
         from scipy.stats import qmc
     except ImportError as error:
         raise ImportError("sampled designs need scipy: pip install 'physjax[sweep]'.") from error
-    positive_integer("count", count)
-    ends = {name: np.asarray(real_quantity(f"range of {name}", ends), float) for name, ends in ranges.items()}
+    as_positive_integer("count", count)
+    ends = {name: np.asarray(as_real_quantity(f"range of {name}", ends), float) for name, ends in ranges.items()}
     for name, end in ends.items():
         if end.shape != (2,) or not end[0] < end[1]:
             raise ValueError(f"range of {name}: got {end.tolist()}, expected (low, high) with low < high.")

@@ -20,44 +20,44 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-_CALLS = {"pure_callback", "io_callback", "debug_callback", "debug_print", "ffi_call"}
+_CALL_PRIMITIVES = {"pure_callback", "io_callback", "debug_callback", "debug_print", "ffi_call"}
 _LIBRARIES = {"numpy", "scipy", "jax", "jaxlib", "math", "cmath", "operator", "functools", "itertools", "builtins"}
 """Packages whose functions do the same wherever their version is the same."""
-_PURE = (
+_PURE_BUILTIN_WORDS = (
     "abs all any bool bytes complex dict divmod enumerate filter float frozenset int isinstance len list map max min pow "
     "print range reversed round set slice sorted str sum tuple zip Exception ArithmeticError AssertionError IndexError "
     "FloatingPointError KeyError OverflowError RuntimeError TypeError ValueError ZeroDivisionError"
 )
-_HIDDEN = (
+_UNREPEATABLE_WORDS = (
     "random rand randn randint default_rng seed load loadtxt genfromtxt fromfile memmap open open_memmap DataSource io "
     "lib ctypeslib f2py environ __dict__ __globals__ __import__ import_module"
 )
-_BUILTINS = frozenset(_PURE.split())
-_UNREPEATABLE = frozenset(_HIDDEN.split())
+_PURE_BUILTINS = frozenset(_PURE_BUILTIN_WORDS.split())
+_UNREPEATABLE = frozenset(_UNREPEATABLE_WORDS.split())
 """Names in those packages behind which there are files, generators, or what nobody can see."""
 
 
-def inside(equation: Any) -> list[Jaxpr]:
+def list_inner_jaxprs(equation: Any) -> list[Jaxpr]:
     """The programs that an operation runs: bodies of loops, branches, functions."""
     found = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda p: isinstance(p, Jaxpr | ClosedJaxpr))
     return [p.jaxpr if isinstance(p, ClosedJaxpr) else p for p in found if isinstance(p, Jaxpr | ClosedJaxpr)]
 
 
-def host_calls(jaxpr: Jaxpr) -> list[tuple[str, Any]]:
+def find_host_calls(jaxpr: Jaxpr) -> list[tuple[str, Any]]:
     """Everything that a program calls outside of itself, by kind, with the function (or what is printed, or the name)."""
     found = []
     for equation in jaxpr.eqns:
         name, params = equation.primitive.name, equation.params
-        if name in _CALLS:
+        if name in _CALL_PRIMITIVES:
             called = params.get("callback", params.get("fmt", params.get("target_name")))
             heard = name == "pure_callback" or (name == "io_callback" and equation.outvars)
             kind = name if heard or name == "ffi_call" else "message"
             found.append((kind, getattr(called, "callback_func", called)))
-        found += [call for body in inside(equation) for call in host_calls(body)]
+        found += [call for body in list_inner_jaxprs(equation) for call in find_host_calls(body)]
     return found
 
 
-def lasting_digest(digest: str, calls: tuple[tuple[str, Any], ...]) -> str:
+def persistent_digest(digest: str, calls: tuple[tuple[str, Any], ...]) -> str:
     """The hash of a program together with the Python functions it calls back; ValueError where one cannot be known again."""
     heard = [(kind, called) for kind, called in calls if kind != "message"]
     if not heard:
@@ -65,24 +65,26 @@ def lasting_digest(digest: str, calls: tuple[tuple[str, Any], ...]) -> str:
     found = hashlib.sha256(digest.encode())
     for kind, called in heard:
         if kind == "ffi_call":
-            raise ValueError(_refused(f"it calls the compiled code of {called!r} through jax.ffi"))
+            raise ValueError(_refusal_text(f"it calls the compiled code of {called!r} through jax.ffi"))
         if kind == "unknown":
-            raise ValueError(_refused("it calls Python in a way that is not known here"))
+            raise ValueError(_refusal_text("it calls Python in a way that is not known here"))
         if kind == "io_callback":
-            raise ValueError(_refused(f"its io_callback to {_named(called)} may return something else each time"))
+            raise ValueError(
+                _refusal_text(f"its io_callback to {_callable_name(called)} may return something else each time")
+            )
         try:
-            for part in _parts(called, []):
+            for part in _walk_value(called, []):
                 found.update(len(part).to_bytes(8, "big") + part)
-        except Unseen as error:
-            raise ValueError(_refused(f"its callback {_named(called)} depends on {error}")) from error
+        except UnknownDependency as error:
+            raise ValueError(_refusal_text(f"its callback {_callable_name(called)} depends on {error}")) from error
     return found.hexdigest()
 
 
-class Unseen(Exception):
+class UnknownDependency(Exception):
     """What a function depends on, of which no identity is known that lasts."""
 
 
-def _refused(reason: str) -> str:
+def _refusal_text(reason: str) -> str:
     return (
         f"sweep: got out= with a measure that calls out of its program, and {reason}: a folder could not tell it from another "
         "one. Expected a measure in jnp, or a pure_callback to a function of numbers, arrays and functions of NumPy and "
@@ -90,11 +92,11 @@ def _refused(reason: str) -> str:
     )
 
 
-def _named(called: Any) -> str:
+def _callable_name(called: Any) -> str:
     return getattr(called, "__qualname__", type(called).__name__)
 
 
-def _parts(value: Any, seen: list) -> Iterator[bytes]:
+def _walk_value(value: Any, seen: list) -> Iterator[bytes]:
     """Bytes that are the same for two values only if they do the same; Unseen for what cannot be looked into."""
     kind = type(value)
     if any(value is other for other in seen):
@@ -102,102 +104,102 @@ def _parts(value: Any, seen: list) -> Iterator[bytes]:
     elif value is None or value is Ellipsis or kind in (bool, int, float, complex, str, bytes):
         yield f"{kind.__name__} {value!r}".encode()
     elif isinstance(value, jax.Array) or kind is np.ndarray or isinstance(value, np.generic):
-        yield from _array_parts(value)
+        yield from _walk_array(value)
     elif isinstance(value, np.dtype):
         yield f"dtype {value!r}".encode()
     elif kind in (tuple, list, dict, set, frozenset):
-        yield from _collection_parts(value, seen)
+        yield from _walk_collection(value, seen)
     elif isinstance(value, types.ModuleType):
-        yield _library(value.__name__).encode()
+        yield _module_version(value.__name__).encode()
     elif (name := _library_name(value)) is not None:
         yield name.encode()
     elif kind is functools.partial:
         seen.append(value)
-        yield from _all_parts(("partial", value.func, value.args, value.keywords), seen)
+        yield from _walk_values(("partial", value.func, value.args, value.keywords), seen)
     elif kind is types.MethodType:
-        yield from _all_parts(("method", value.__func__, value.__self__), seen)
+        yield from _walk_values(("method", value.__func__, value.__self__), seen)
     elif kind is types.FunctionType:
         seen.append(value)
-        yield from _function_parts(value, seen)
+        yield from _walk_function(value, seen)
     elif kind is types.CodeType:
-        yield from _code_parts(value, seen)
+        yield from _walk_code(value, seen)
     else:
-        raise Unseen(f"an object of type {kind.__module__}.{kind.__qualname__}")
+        raise UnknownDependency(f"an object of type {kind.__module__}.{kind.__qualname__}")
 
 
-def _all_parts(values: Any, seen: list) -> Iterator[bytes]:
+def _walk_values(values: Any, seen: list) -> Iterator[bytes]:
     for value in values:
-        yield from _parts(value, seen)
+        yield from _walk_value(value, seen)
 
 
-def _array_parts(value: Any) -> Iterator[bytes]:
+def _walk_array(value: Any) -> Iterator[bytes]:
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         yield str(jax.random.key_impl(value)).encode()
         value = jax.random.key_data(value)
     array = np.asarray(value)
     if array.dtype.hasobject:
-        raise Unseen("an array of objects")
+        raise UnknownDependency("an array of objects")
     yield f"{type(value) is np.ndarray} {array.dtype!r} {array.shape}".encode()
     yield np.ascontiguousarray(array).tobytes()
 
 
-def _collection_parts(value: Any, seen: list) -> Iterator[bytes]:
+def _walk_collection(value: Any, seen: list) -> Iterator[bytes]:
     yield f"{type(value).__name__} {len(value)}".encode()
     if isinstance(value, set | frozenset):  # in no order: each by its own hash
         digests = []
         for one in value:
             found = hashlib.sha256()
-            for part in _parts(one, list(seen)):
+            for part in _walk_value(one, list(seen)):
                 found.update(len(part).to_bytes(8, "big") + part)
             digests.append(found.digest())
         yield from sorted(digests)
         return
     seen.append(value)
-    yield from _all_parts(value.items() if isinstance(value, dict) else value, seen)
+    yield from _walk_values(value.items() if isinstance(value, dict) else value, seen)
 
 
-def _function_parts(function: types.FunctionType, seen: list) -> Iterator[bytes]:
+def _walk_function(function: types.FunctionType, seen: list) -> Iterator[bytes]:
     """Code, defaults, attributes, what it closes over, and the globals that its code reads."""
     yield f"function, Python {sys.version_info[:2]}".encode()
     try:
         closed = tuple(cell.cell_contents for cell in function.__closure__ or ())
     except ValueError as error:
-        raise Unseen("a variable that has no value yet") from error
-    yield from _parts(function.__code__, seen)
-    yield from _all_parts((function.__defaults__, function.__kwdefaults__, dict(vars(function)), closed), seen)
-    for name in sorted(_globals_read(function.__code__)):
+        raise UnknownDependency("a variable that has no value yet") from error
+    yield from _walk_value(function.__code__, seen)
+    yield from _walk_values((function.__defaults__, function.__kwdefaults__, dict(vars(function)), closed), seen)
+    for name in sorted(_find_globals(function.__code__)):
         yield name.encode()
         if name in function.__globals__:
-            yield from _parts(function.__globals__[name], seen)
-        elif name not in _BUILTINS or not hasattr(builtins, name):
-            raise Unseen(f"{name!r}")
+            yield from _walk_value(function.__globals__[name], seen)
+        elif name not in _PURE_BUILTINS or not hasattr(builtins, name):
+            raise UnknownDependency(f"{name!r}")
 
 
-def _globals_read(code: types.CodeType) -> set[str]:
+def _find_globals(code: types.CodeType) -> set[str]:
     """The names of a module that code and the functions in it read; Unseen for what would change one, or bring one in."""
     names = set()
     for step in dis.get_instructions(code):
         if step.opname == "IMPORT_NAME":
-            _library(step.argval)
+            _module_version(step.argval)
         elif step.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-            raise Unseen(f"the global {step.argval!r}, which it changes")
+            raise UnknownDependency(f"the global {step.argval!r}, which it changes")
         elif step.opname == "LOAD_BUILD_CLASS":
-            raise Unseen("a class of its own")
+            raise UnknownDependency("a class of its own")
         elif step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
             names.add(step.argval)
     if hidden := sorted(set(code.co_names) & _UNREPEATABLE):
-        raise Unseen(f"{hidden[0]!r}")
-    return names.union(*(_globals_read(part) for part in code.co_consts if isinstance(part, types.CodeType)))
+        raise UnknownDependency(f"{hidden[0]!r}")
+    return names.union(*(_find_globals(part) for part in code.co_consts if isinstance(part, types.CodeType)))
 
 
-def _code_parts(code: types.CodeType, seen: list) -> Iterator[bytes]:
+def _walk_code(code: types.CodeType, seen: list) -> Iterator[bytes]:
     """What is computed, without where it stands and what it is called."""
     yield code.co_code
     yield code.co_exceptiontable
     counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags)
     names = (code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
     yield repr((counts, names)).encode()
-    yield from _all_parts(code.co_consts, seen)
+    yield from _walk_values(code.co_consts, seen)
 
 
 def _library_name(value: Any) -> str | None:
@@ -217,17 +219,17 @@ def _library_name(value: Any) -> str | None:
     if found is not value:
         return None
     if not _UNREPEATABLE.isdisjoint({*module.split("."), *name.split(".")}) or (
-        module == "builtins" and name not in _BUILTINS
+        module == "builtins" and name not in _PURE_BUILTINS
     ):
-        raise Unseen(f"{module}.{name}")
-    return f"{_library(module)} {name}"
+        raise UnknownDependency(f"{module}.{name}")
+    return f"{_module_version(module)} {name}"
 
 
-def _library(module: str) -> str:
+def _module_version(module: str) -> str:
     """A library's module with its version; Unseen for the user's own and for those that read files or draw numbers."""
     top = module.partition(".")[0]
     if top not in _LIBRARIES or not _UNREPEATABLE.isdisjoint(module.split(".")):
-        raise Unseen(f"the module {module}")
+        raise UnknownDependency(f"the module {module}")
     try:
         return f"{module} {version(top)}"
     except PackageNotFoundError:  # the standard library's

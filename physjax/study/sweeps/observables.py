@@ -10,18 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from physjax.checks import known, positive_integer
+from physjax.checks import as_positive_integer, demand_known
 from physjax.stepping.simulate import simulate
 from physjax.study.energy.quantities import total
 from physjax.study.problem import Problem
 from physjax.study.sweeps.batching import Run
-from physjax.study.sweeps.design import checked_lanes
+from physjax.study.sweeps.design import build_lanes
 from physjax.study.sweeps.result import Sweep
 from physjax.study.sweeps.sweep import sweep
 from physjax.trajectory import Trajectory
 from physjax.vectors import norm
 
-FRAMES = 32
+OBSERVED_FRAMES = 32
 """Moments of a run that an outcome sees."""
 
 
@@ -46,18 +46,18 @@ def energy(flight: Trajectory) -> Float[Array, ""]:
     return jnp.sum(total(end, flight.time[-1], end.state))
 
 
-OUTCOMES = {outcome.__name__: outcome for outcome in (height, distance, speed, energy)}
+OBSERVABLES = {outcome.__name__: outcome for outcome in (height, distance, speed, energy)}
 """Outcomes by name: functions of a `Trajectory`; their docstrings say what they are, and in which unit."""
 
 
-class _Lane(NamedTuple):
+class _SweptProblem(NamedTuple):
     """What differs between the lanes of a sweep over a scene's numbers."""
 
     built: Any
     duration: float
 
 
-def swept_scene(
+def sweep_scene(
     build: Callable[..., Problem],
     axes: Mapping[str, Any],
     outcome: str,
@@ -72,27 +72,27 @@ def swept_scene(
     before the first one runs. `options` go to `sweep`. Raises ValueError for names that are not known, and where a
     number changes the shape of the scene.
     """
-    outcome = known("outcome", outcome, OUTCOMES)
-    grid = checked_lanes(axes, "grid")
+    outcome = demand_known("outcome", outcome, OBSERVABLES)
+    grid = build_lanes(axes, "grid")
     takes = inspect.signature(build).parameters
     for name in axes:
-        known(f"number of {build.__name__}", name, takes)
-    values = [axis.coordinate if takes[axis.name].annotation is not int else _whole(axis) for axis in grid.axes]
+        demand_known(f"number of {build.__name__}", name, takes)
+    values = [axis.coordinate if takes[axis.name].annotation is not int else _check_counts(axis) for axis in grid.axes]
     built = [build(**dict(zip(axes, point, strict=True))) for point in itertools.product(*(v.tolist() for v in values))]
     flat = {axis.name: axis.at(i) for axis, i in zip(grid.axes, grid.indices(np.arange(grid.count)), strict=True)}
-    each = -(-positive_integer("steps", steps) // FRAMES)
+    each = -(-as_positive_integer("steps", steps) // OBSERVED_FRAMES)
 
     def measure(scene, **_):
-        dt = scene.duration / (each * FRAMES)
-        flight = simulate(scene.built, method, dt=dt, steps=each * FRAMES, save_every=each)
-        return {outcome: OUTCOMES[outcome](flight), "run": Run(None, None, None, flight.ok)}
+        dt = scene.duration / (each * OBSERVED_FRAMES)
+        flight = simulate(scene.built, method, dt=dt, steps=each * OBSERVED_FRAMES, save_every=each)
+        return {outcome: OBSERVABLES[outcome](flight), "run": Run(None, None, None, flight.ok)}
 
-    problems = [_Lane(problem.scene, problem.duration) for problem in built]
+    problems = [_SweptProblem(problem.scene, problem.duration) for problem in built]
     found = sweep(measure, flat | {"scene": problems}, design="zip", **options)
     return replace(found, lanes=grid)
 
 
-def _whole(axis: Any) -> np.ndarray:
+def _check_counts(axis: Any) -> np.ndarray:
     """The values of an axis that counts something."""
     counts = np.round(axis.coordinate).astype(int)
     if np.any(counts != axis.coordinate):

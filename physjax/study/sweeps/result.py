@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from physjax.files import read_arrays, replacing
+from physjax.files import read_arrays, write_atomically
 from physjax.study.sweeps import store as chunks
 from physjax.study.sweeps.design import DESIGNS, Axis, Lanes, leaf_name
 
-_WRITER = "one written by Sweep.save, or a sweep's folder"
-MISSING = "not computed yet"
+_EXPECTED_SOURCE = "one written by Sweep.save, or a sweep's folder"
+MISSING_REASON = "not computed yet"
 """Status -1: lanes of chunks that are not there."""
 
 
@@ -86,7 +86,11 @@ class Sweep:
         arrays = self.arrays
         if self.rebuild is not None:
             return self.rebuild(list(arrays.values()))
-        return arrays["value"] if list(arrays) == ["value"] else {_bare(name): array for name, array in arrays.items()}
+        return (
+            arrays["value"]
+            if list(arrays) == ["value"]
+            else {_strip_prefix(name): array for name, array in arrays.items()}
+        )
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
@@ -96,17 +100,23 @@ class Sweep:
     def reason(self, index: int | tuple[int, ...]) -> str:
         """What went wrong in a lane; "ok" if nothing did."""
         code = int(self.status[index])
-        return MISSING if code < 0 else self.reasons[code]
+        return MISSING_REASON if code < 0 else self.reasons[code]
 
     @property
     def failures(self) -> dict[str, int]:
         """How many lanes failed, by reason."""
         codes, counts = np.unique(self.status[~self.ok], return_counts=True)
-        return {MISSING if code < 0 else self.reasons[code]: int(n) for code, n in zip(codes, counts, strict=True)}
+        return {
+            MISSING_REASON if code < 0 else self.reasons[code]: int(n) for code, n in zip(codes, counts, strict=True)
+        }
 
     def number(self, of: str | None = None) -> np.ndarray:
         """The one number of each lane that is to be looked at, by its name where there are several."""
-        numbers = {_bare(n): a for n, a in self.arrays.items() if a.shape == self.shape and not _bare(n).endswith("ok")}
+        numbers = {
+            _strip_prefix(n): a
+            for n, a in self.arrays.items()
+            if a.shape == self.shape and not _strip_prefix(n).endswith("ok")
+        }
         if of is None and len(numbers) == 1:
             return next(iter(numbers.values()))
         if of not in numbers:
@@ -149,7 +159,7 @@ class Sweep:
         zipped = self.lanes.design == "zip"
         dims = ("lane",) if zipped else tuple(axis.name for axis in self.lanes.axes)
         # a variable must not have the name of a dimension unless it is its coordinate
-        data = {(_bare(n) if _bare(n) not in self.axes else n): a for n, a in self.arrays.items()} | {
+        data = {(_strip_prefix(n) if _strip_prefix(n) not in self.axes else n): a for n, a in self.arrays.items()} | {
             "status": self.status
         }
         variables = {n: (dims + tuple(f"{n}_{i}" for i in range(a.ndim - len(dims))), a) for n, a in data.items()}
@@ -158,7 +168,7 @@ class Sweep:
 
     def save(self, path: str | os.PathLike) -> None:
         """Write what `to_numpy` gives as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent."""
-        with replacing(path, "wb") as file:
+        with write_atomically(path, "wb") as file:
             np.savez_compressed(file, **self.to_numpy(), design=np.array(self.lanes.design))
 
 
@@ -170,15 +180,15 @@ def load(path: str | os.PathLike) -> Sweep:
     path = Path(path)
     if path.is_dir():
         folder = chunks.found(path)
-        lanes = _lanes(read_arrays(path / "axes.npz", _WRITER), folder.manifest["design"])
+        lanes = _read_lanes(read_arrays(path / "axes.npz", _EXPECTED_SOURCE), folder.manifest["design"])
         if {axis.name: axis.digest for axis in lanes.axes} != folder.manifest["axes"]:
             raise ValueError(f"load: {path / 'axes.npz'} does not hold the axes of this sweep. Use another folder.")
-        return Sweep(lanes, tuple(folder.manifest["reasons"]), folder.gathered)
-    arrays = read_arrays(path, _WRITER)
+        return Sweep(lanes, tuple(folder.manifest["reasons"]), folder.gather)
+    arrays = read_arrays(path, _EXPECTED_SOURCE)
     missing = {"status", "reasons", "design"} - set(arrays)
     if missing:
         raise ValueError(f"load: {path} is not a saved sweep: it lacks {', '.join(sorted(missing))}.")
-    lanes = _lanes(arrays, str(arrays["design"]))
+    lanes = _read_lanes(arrays, str(arrays["design"]))
     flat = {name: a for name, a in arrays.items() if name.partition(".")[0] == "value" or name == "status"}
     _demand_sweep(path, arrays, lanes, flat)
     flat = {name: a.reshape(lanes.count, *a.shape[len(lanes.shape) :]) for name, a in flat.items()}
@@ -223,7 +233,7 @@ def value_names(values: Any) -> list[str]:
     return [f"value.{path}" if path else "value" for path in paths]
 
 
-def _lanes(arrays: dict[str, np.ndarray], design: str) -> Lanes:
+def _read_lanes(arrays: dict[str, np.ndarray], design: str) -> Lanes:
     """The axes of a file: records come back as dicts by name."""
     axes: dict[str, Any] = {}
     for name, array in arrays.items():
@@ -234,5 +244,5 @@ def _lanes(arrays: dict[str, np.ndarray], design: str) -> Lanes:
     return Lanes(tuple(Axis(name, values) for name, values in axes.items()), design)
 
 
-def _bare(name: str) -> str:
+def _strip_prefix(name: str) -> str:
     return name.removeprefix("value.")

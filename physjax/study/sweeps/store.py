@@ -21,13 +21,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from physjax.files import replacing, writable_folder
+from physjax.files import ensure_writable_folder, write_atomically
 
-CHUNK = re.compile(r"chunk-(\d{8})-([0-9a-f]{64})\.npz")
-HALF = re.compile(r"\.chunk-(\d{8})-.*")
+CHUNK_FILE_PATTERN = re.compile(r"chunk-(\d{8})-([0-9a-f]{64})\.npz")
+PARTIAL_FILE_PATTERN = re.compile(r"\.chunk-(\d{8})-.*")
 """What a killed process leaves of a chunk that it was writing."""
 MANIFEST = "manifest.json"
-SAYS = {
+MISMATCH_TEXTS = {
     "axes": "other values on the axes",
     "design": "another design",
     "measure": "another measure, or one with other constants",
@@ -41,12 +41,12 @@ SAYS = {
 """What the entries of a manifest mean where they differ."""
 
 
-def versions() -> dict[str, str]:
+def collect_versions() -> dict[str, str]:
     """Of the packages that decide about bits."""
     return {name: version(name) for name in ("jax", "jaxlib", "numpy")}
 
 
-def identity(manifest: Mapping[str, Any]) -> str:
+def hash_manifest(manifest: Mapping[str, Any]) -> str:
     """A hash of a manifest."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
@@ -72,7 +72,7 @@ class Store(ABC):
         batch = self.manifest["batch"]
         return chunk * batch, min((chunk + 1) * batch, self.lanes)
 
-    def empty(self) -> dict[str, np.ndarray]:
+    def allocate_arrays(self) -> dict[str, np.ndarray]:
         """Room for all lanes, none of which is there: zeros, and a status of -1."""
         outputs = self.manifest["outputs"].items()
         whole = {name: np.zeros((self.lanes, *shape), dtype) for name, (shape, dtype) in outputs}
@@ -80,7 +80,7 @@ class Store(ABC):
         return whole
 
     @abstractmethod
-    def finished(self) -> dict[int, Any]:
+    def find_finished(self) -> dict[int, Any]:
         """The chunks that are there, by number, to be `read`."""
 
     @abstractmethod
@@ -92,7 +92,7 @@ class Store(ABC):
         """Keep a chunk."""
 
     @abstractmethod
-    def gathered(self) -> dict[str, np.ndarray]:
+    def gather(self) -> dict[str, np.ndarray]:
         """All lanes; those of chunks that are not there have status -1 and zeros."""
 
     @abstractmethod
@@ -100,14 +100,14 @@ class Store(ABC):
         """Wait until all processes have finished, and let each have all chunks."""
 
 
-class InMemory(Store):
+class MemoryStore(Store):
     """Chunks as parts of whole arrays."""
 
     def __init__(self, manifest: dict[str, Any]):
         super().__init__(manifest)
-        self.arrays = self.empty()
+        self.arrays = self.allocate_arrays()
 
-    def finished(self) -> dict[int, slice]:
+    def find_finished(self) -> dict[int, slice]:
         """None: a sweep in memory begins anew."""
         return {}
 
@@ -120,7 +120,7 @@ class InMemory(Store):
         for name, array in arrays.items():
             self.arrays[name][slice(*self.range(chunk))] = array
 
-    def gathered(self) -> dict[str, np.ndarray]:
+    def gather(self) -> dict[str, np.ndarray]:
         """The arrays as they are."""
         return self.arrays
 
@@ -141,18 +141,18 @@ class InMemory(Store):
                 array[lanes(i)] = np.ascontiguousarray(one).view(array.dtype).reshape(sent.shape)[: lanes(i).size]
 
 
-class Folder(Store):
+class FolderStore(Store):
     """Chunks as files."""
 
     def __init__(self, path: Path, manifest: dict[str, Any]):
         super().__init__(manifest)
         self.path = path
 
-    def finished(self) -> dict[int, Path]:
+    def find_finished(self) -> dict[int, Path]:
         """The files of finished chunks by number; ValueError for a file that is no chunk of this sweep by its name."""
         found: dict[int, Path] = {}
         for path in sorted(self.path.glob("chunk-*")):
-            named = CHUNK.fullmatch(path.name)
+            named = CHUNK_FILE_PATTERN.fullmatch(path.name)
             number = int(named[1]) if named else -1
             if not 0 <= number < self.chunks or number in found:
                 raise ValueError(
@@ -164,10 +164,10 @@ class Folder(Store):
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a chunk, whole and on the disk when this returns; OSError in plain words when it cannot be."""
         content = io.BytesIO()
-        np.savez(content, **arrays, sweep=np.array(identity(self.manifest)))
+        np.savez(content, **arrays, sweep=np.array(hash_manifest(self.manifest)))
         name = f"chunk-{chunk:08d}-{hashlib.sha256(content.getbuffer()).hexdigest()}.npz"
         try:
-            with replacing(self.path / name, "wb", durable=True) as file:
+            with write_atomically(self.path / name, "wb", durable=True) as file:
                 file.write(content.getbuffer())
         except OSError as error:
             raise OSError(
@@ -178,7 +178,7 @@ class Folder(Store):
     def read(self, path: Path) -> dict[str, np.ndarray]:
         """The arrays of a chunk; ValueError naming a file that is damaged or of another sweep."""
         content = path.read_bytes()
-        if hashlib.sha256(content).hexdigest() != CHUNK.fullmatch(path.name)[2]:
+        if hashlib.sha256(content).hexdigest() != CHUNK_FILE_PATTERN.fullmatch(path.name)[2]:
             raise ValueError(
                 f"sweep: the chunk {path} is damaged: its content is not what was written. Delete it, and run the same sweep "
                 "again to have it computed anew."
@@ -188,14 +188,14 @@ class Folder(Store):
                 arrays = dict(archive)
         except (ValueError, zipfile.BadZipFile) as error:
             raise ValueError(f"sweep: the chunk {path} was not written by a sweep ({error}). Move it out.") from error
-        if str(arrays.pop("sweep", "")) != identity(self.manifest):
+        if str(arrays.pop("sweep", "")) != hash_manifest(self.manifest):
             raise ValueError(f"sweep: the chunk {path} belongs to another sweep. Move it out of the folder.")
         return arrays
 
-    def gathered(self) -> dict[str, np.ndarray]:
+    def gather(self) -> dict[str, np.ndarray]:
         """All lanes of all finished chunks; lanes of others have status -1 and zeros."""
-        whole = self.empty()
-        for chunk, path in self.finished().items():
+        whole = self.allocate_arrays()
+        for chunk, path in self.find_finished().items():
             for name, array in self.read(path).items():
                 whole[name][slice(*self.range(chunk))] = array
         return whole
@@ -204,42 +204,45 @@ class Folder(Store):
         """Wait; the folder is there for all."""
         from jax.experimental.multihost_utils import sync_global_devices
 
-        sync_global_devices(f"sweep {identity(self.manifest)}")
+        sync_global_devices(f"sweep {hash_manifest(self.manifest)}")
 
 
 @contextmanager
-def opened(
+def open_folder(
     path: str | os.PathLike, manifest: dict[str, Any], shard: tuple[int, int], axes: Mapping
-) -> Iterator[Folder]:
+) -> Iterator[FolderStore]:
     """The folder of a sweep, locked for one process or shard; ValueError if it is in use or holds another sweep.
 
     The locks are the system's and go with the process, however it ends. A new folder also gets the axes, as `axes.npz`.
     """
-    path = writable_folder(path)
+    path = ensure_writable_folder(path)
     i, n = shard
-    with _locked(path / ".lock", shared=n > 1, who=path), _locked(path / f".lock-{i}-of-{n}", shared=False, who=path):
-        with _locked(path / ".lock-manifest", shared=False, who=path, wait=True):
-            folder = Folder(path, _agreed(path, manifest, axes))
+    with (
+        _lock_file(path / ".lock", shared=n > 1, who=path),
+        _lock_file(path / f".lock-{i}-of-{n}", shared=False, who=path),
+    ):
+        with _lock_file(path / ".lock-manifest", shared=False, who=path, wait=True):
+            folder = FolderStore(path, _read_or_write_manifest(path, manifest, axes))
         for half in path.iterdir():
-            if (named := HALF.fullmatch(half.name)) and int(named[1]) % n == i:
+            if (named := PARTIAL_FILE_PATTERN.fullmatch(half.name)) and int(named[1]) % n == i:
                 half.unlink()
         yield folder
 
 
-def found(path: str | os.PathLike) -> Folder:
+def found(path: str | os.PathLike) -> FolderStore:
     """A folder that a sweep has written into."""
     try:
         manifest = json.loads((Path(path) / MANIFEST).read_text(encoding="utf-8"))
-        if identity(manifest["sweep"]) != manifest["identity"]:
+        if hash_manifest(manifest["sweep"]) != manifest["identity"]:
             raise ValueError("it was changed")
     except FileNotFoundError as error:
         raise FileNotFoundError(f"sweep: there is no sweep in {path}: it has no {MANIFEST}.") from error
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"sweep: {Path(path) / MANIFEST} is damaged ({error}). Use another folder.") from error
-    return Folder(Path(path), manifest["sweep"])
+    return FolderStore(Path(path), manifest["sweep"])
 
 
-def begun(path: str | os.PathLike) -> tuple[int, int] | None:
+def read_layout(path: str | os.PathLike) -> tuple[int, int] | None:
     """Lanes in a chunk and in a block of the sweep that has begun in a folder; None where there is none."""
     if not (Path(path) / MANIFEST).exists():
         return None
@@ -247,37 +250,42 @@ def begun(path: str | os.PathLike) -> tuple[int, int] | None:
     return manifest["batch"], manifest["block"]
 
 
-def _agreed(path: Path, manifest: dict[str, Any], axes: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _read_or_write_manifest(path: Path, manifest: dict[str, Any], axes: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """The folder's manifest, written if there is none; ValueError saying in what it differs from this one."""
     manifest = json.loads(json.dumps(manifest))
     if (path / MANIFEST).exists():
         old = found(path).manifest
         differing = [key for key in manifest if old.get(key) != manifest[key]]
         if differing:
-            told = "; ".join(f"{SAYS.get(key, key)} ({_difference(old.get(key), manifest[key])})" for key in differing)
-            raise ValueError(f"sweep: {path} holds another sweep: {told}. Choose another folder, or sweep as before.")
+            differences = "; ".join(
+                f"{MISMATCH_TEXTS.get(key, key)} ({_describe_difference(old.get(key), manifest[key])})"
+                for key in differing
+            )
+            raise ValueError(
+                f"sweep: {path} holds another sweep: {differences}. Choose another folder, or sweep as before."
+            )
         return old
     if any(path.glob("chunk-*")):
         raise ValueError(
             f"sweep: {path} holds chunks but no {MANIFEST}, so nobody knows of what. Choose another folder."
         )
-    with replacing(path / "axes.npz", "wb", durable=True) as file:
+    with write_atomically(path / "axes.npz", "wb", durable=True) as file:
         np.savez(file, **axes)
-    with replacing(path / MANIFEST, durable=True) as file:
-        json.dump({"identity": identity(manifest), "sweep": manifest}, file, indent=1)
+    with write_atomically(path / MANIFEST, durable=True) as file:
+        json.dump({"identity": hash_manifest(manifest), "sweep": manifest}, file, indent=1)
     return manifest
 
 
-def _difference(old: Any, new: Any) -> str:
+def _describe_difference(old: Any, new: Any) -> str:
     """In what two entries differ; long hashes are cut."""
     if isinstance(old, dict) and isinstance(new, dict):
         keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-        return ", ".join(f"{key}: {_difference(old.get(key), new.get(key))}" for key in keys)
+        return ", ".join(f"{key}: {_describe_difference(old.get(key), new.get(key))}" for key in keys)
     return f"{str(old)[:16]} there, {str(new)[:16]} here"
 
 
 @contextmanager
-def _locked(path: Path, shared: bool, who: Path, wait: bool = False) -> Iterator[None]:
+def _lock_file(path: Path, shared: bool, who: Path, wait: bool = False) -> Iterator[None]:
     """Hold a lock file; where another process does, wait, or raise a ValueError at once."""
     import fcntl  # POSIX: elsewhere sweeps are kept in memory
 
@@ -292,6 +300,6 @@ def _locked(path: Path, shared: bool, who: Path, wait: bool = False) -> Iterator
         yield
 
 
-def backend() -> str:
+def describe_backend() -> str:
     """The kind of device and the precision, which decide about bits."""
     return f"{jax.default_backend()}, x64 {'on' if jax.config.jax_enable_x64 else 'off'}"

@@ -32,15 +32,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from physjax.checks import positive_integer
+from physjax.checks import as_positive_integer
 from physjax.study.sweeps import store as chunks
-from physjax.study.sweeps.batching import Layout, Traced, compiled, layout, traced
-from physjax.study.sweeps.design import Lanes, checked_lanes, latin_hypercube, sobol
+from physjax.study.sweeps.batching import LaneProgram, Layout, choose_layout, compile_batch, trace_measure
+from physjax.study.sweeps.design import Lanes, build_lanes, latin_hypercube, sobol
 from physjax.study.sweeps.result import Sweep, load, value_names
-from physjax.study.sweeps.store import InMemory, Store
+from physjax.study.sweeps.store import MemoryStore, Store
 from physjax.text import progress_bar
 
-MEMORY = 1 << 30
+BATCH_MEMORY_BYTES = 1 << 30
 """Bytes that batches may take unless told otherwise; the results themselves come on top where they are kept in memory."""
 
 
@@ -50,7 +50,7 @@ def sweep(
     *,
     design: str = "grid",
     batch: int | None = None,
-    memory: int = MEMORY,
+    memory: int = BATCH_MEMORY_BYTES,
     out: Any = None,
     progress: bool = True,
     devices: Sequence[Any] | None = None,
@@ -89,31 +89,31 @@ def sweep(
         [[ 2.5  5. ]
          [10.  20. ]]
     """
-    lanes = checked_lanes(axes, design)
-    devices = _checked_devices(devices)
-    i, n = _checked_shard(shard)
+    lanes = build_lanes(axes, design)
+    devices = _check_devices(devices)
+    i, n = _check_shard(shard)
     if not callable(measure):
         raise TypeError(f"measure: got {measure!r}, expected a function of {', '.join(axes)}.")
-    batch = None if batch is None else min(positive_integer("batch", batch), lanes.count)
+    batch = None if batch is None else min(as_positive_integer("batch", batch), lanes.count)
     if out is not None:
-        chunks.writable_folder(out)
-    begun = None if out is None else chunks.begun(out)
-    program = traced(measure, _shapes(lanes))
-    cut = layout(program, lanes.count, positive_integer("memory [bytes]", memory), devices, batch, begun)
-    manifest = _manifest(lanes, program, cut, program.digest if out is None else program.lasting_digest)
+        chunks.ensure_writable_folder(out)
+    begun = None if out is None else chunks.read_layout(out)
+    program = trace_measure(measure, _build_abstract_point(lanes))
+    cut = choose_layout(program, lanes.count, as_positive_integer("memory [bytes]", memory), devices, batch, begun)
+    manifest = _build_manifest(lanes, program, cut, program.digest if out is None else program.persistent_digest)
     rebuild = jax.tree.structure(program.values).unflatten
-    with nullcontext() if out is None else chunks.opened(out, manifest, (i, n), lanes.arrays) as folder:
-        store = InMemory(manifest) if folder is None else folder
-        _compute(store, lanes, program, cut, devices, (i, n), progress)
+    with nullcontext() if out is None else chunks.open_folder(out, manifest, (i, n), lanes.arrays) as folder:
+        store = MemoryStore(manifest) if folder is None else folder
+        _compute_chunks(store, lanes, program, cut, devices, (i, n), progress)
     if jax.process_count() > 1 and shard is None:
         store.share(n)
-    return Sweep(lanes, program.reasons, store.gathered, rebuild)
+    return Sweep(lanes, program.reasons, store.gather, rebuild)
 
 
-def _compute(
+def _compute_chunks(
     store: Store,
     lanes: Lanes,
-    program: Traced,
+    program: LaneProgram,
     cut: Layout,
     devices: tuple,
     shard: tuple[int, int],
@@ -121,11 +121,11 @@ def _compute(
 ) -> None:
     """Compute a shard's chunks that are not there yet, one after the other."""
     mine = range(shard[0], store.chunks, shard[1])
-    done = {chunk for chunk, path in store.finished().items() if chunk in mine and store.read(path)}
+    done = {chunk for chunk, path in store.find_finished().items() if chunk in mine and store.read(path)}
     left = [chunk for chunk in mine if chunk not in done]
     count = lambda some: sum(stop - start for start, stop in map(store.range, some))  # noqa: E731
     with progress_bar(progress=progress, total=count(mine), initial=count(done), unit="lane", unit_scale=True) as shown:
-        run = compiled(program, cut, devices) if left else None
+        run = compile_batch(program, cut, devices) if left else None
         for chunk in left:
             start, stop = store.range(chunk)
             # the last batch is filled up with its last lane, so that there is one shape and one program
@@ -138,13 +138,13 @@ def _compute(
             shown.update(stop - start)
 
 
-def _manifest(lanes: Lanes, program: Traced, cut: Layout, digest: str) -> dict[str, Any]:
+def _build_manifest(lanes: Lanes, program: LaneProgram, cut: Layout, digest: str) -> dict[str, Any]:
     """What the sweep is, down to what decides about bits."""
     outputs = jax.tree.leaves(program.values)
     names = value_names(program.values)
     return {
-        "versions": chunks.versions(),
-        "backend": chunks.backend(),
+        "versions": chunks.collect_versions(),
+        "backend": chunks.describe_backend(),
         "design": lanes.design,
         "axes": {axis.name: axis.digest for axis in lanes.axes},
         "shape": list(lanes.shape),
@@ -159,22 +159,22 @@ def _manifest(lanes: Lanes, program: Traced, cut: Layout, digest: str) -> dict[s
     }
 
 
-def _shapes(lanes: Lanes) -> dict[str, Any]:
+def _build_abstract_point(lanes: Lanes) -> dict[str, Any]:
     """A point of the design as shapes and dtypes."""
     one = lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype)  # noqa: E731
     return {axis.name: jax.tree.map(one, axis.values) for axis in lanes.axes}
 
 
-def _checked_devices(devices: Sequence[Any] | None) -> tuple:
+def _check_devices(devices: Sequence[Any] | None) -> tuple:
     devices = tuple(jax.local_devices() if devices is None else devices)
     if not devices or not all(device in jax.local_devices() for device in devices):
         raise ValueError(f"devices: got {devices}, expected some of jax.local_devices(): {jax.local_devices()}.")
     return devices
 
 
-def _checked_shard(shard: tuple[int, int] | None) -> tuple[int, int]:
+def _check_shard(shard: tuple[int, int] | None) -> tuple[int, int]:
     i, n = (jax.process_index(), jax.process_count()) if shard is None else shard
-    if not 0 <= positive_integer("shard: i", i, at_least=0) < positive_integer("shard: n", n):
+    if not 0 <= as_positive_integer("shard: i", i, at_least=0) < as_positive_integer("shard: n", n):
         raise ValueError(f"shard: got {(i, n)}, expected (i, n) with i in 0 .. n - 1.")
     return i, n
 

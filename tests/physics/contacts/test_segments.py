@@ -26,12 +26,12 @@ def test_the_deepest_point_of_a_segment(surface, share, gap):
     a, b = jnp.asarray([-1.0, 1.0]), jnp.asarray([1.0, 0.5])
     nearest = contacts.nearest_on_segment(surface, 0.0, a, b)
     dense = np.asarray(a) + np.linspace(0, 1, 100_001)[:, None] * np.asarray(b - a)
-    gaps = np.asarray(surface.gap(0.0, jnp.asarray(dense)))
-    assert float(nearest.gap) == pytest.approx(gaps.min(), abs=1e-9)
+    gaps = np.asarray(surface.signed_distance(0.0, jnp.asarray(dense)))
+    assert float(nearest.signed_distance) == pytest.approx(gaps.min(), abs=1e-9)
     assert float(nearest.share) == pytest.approx(np.argmin(gaps) / 100_000, abs=1e-4)
     if share in (0.0, 1.0):
         assert float(nearest.share) == share
-        assert float(nearest.gap) == pytest.approx(gap)
+        assert float(nearest.signed_distance) == pytest.approx(gap)
 
 
 def test_an_edge_that_meets_a_ball_in_its_middle_shares_the_push():
@@ -42,7 +42,7 @@ def test_an_edge_that_meets_a_ball_in_its_middle_shares_the_push():
     # the point that touched is on the ball now; the edge has turned a little about it
     share = contacts.nearest_on_segment(ball, 0.0, *(state.position for state in before)).share
     touched = (1 - share) * after[0].position + share * after[1].position
-    assert float(ball.gap(0.0, touched)) == pytest.approx(0.0, abs=1e-12)
+    assert float(ball.signed_distance(0.0, touched)) == pytest.approx(0.0, abs=1e-12)
     energy = lambda pair: sum(m * float(jnp.sum(s.velocity**2)) for m, s in zip(masses, pair, strict=True))  # noqa: E731
     assert energy(after) == pytest.approx(energy(before), rel=1e-12)
     sideways = sum(m * float(s.velocity[0]) for m, s in zip(masses, after, strict=True))
@@ -67,4 +67,4 @@ def test_a_face_set_down_touches_with_its_corners():
     assert flat.touching.all()
     tilted = contacts.touching_corners(floor, 0.0, square.at[1:3, 1].set(0.2))
     np.testing.assert_array_equal(tilted.touching, [True, False, False, True])
-    np.testing.assert_allclose(tilted.gap, [0.0, 0.2, 0.2, 0.0])
+    np.testing.assert_allclose(tilted.signed_distance, [0.0, 0.2, 0.2, 0.0])

@@ -11,34 +11,34 @@ from physjax import Particles, Scene, contacts, forces, inertia, methods, rigid,
 
 G = 9.8
 R, r = 1.0, 0.1
-BALL, HULL = inertia.sphere(1.0, r), rigid.Hull.sphere(r)
+BALL, HULL = inertia.sphere(1.0, r), rigid.ContactPoints.sphere(r)
 
 
 class Bowl(contacts.Surface):
     """The inside of a sphere of radius R about the origin, which says no more than its signed distance."""
 
-    def gap(self, t, position):
+    def signed_distance(self, t, position):
         return R - jnp.sqrt(jnp.sum(position * position, axis=-1))
 
 
 class Globe(contacts.Surface):
     """The outside of it, which says no more than that."""
 
-    def gap(self, t, position):
+    def signed_distance(self, t, position):
         return jnp.sqrt(jnp.sum(position * position, axis=-1)) - R
 
 
 class Pillar(contacts.Surface):
     """A post along z, which says no more than its signed distance."""
 
-    def gap(self, t, position):
+    def signed_distance(self, t, position):
         return jnp.hypot(position[..., 0], position[..., 1]) - 0.1
 
 
 class Sheet(contacts.Surface):
     """A plate of a millimetre with two sides, which says no more than that."""
 
-    def gap(self, t, position):
+    def signed_distance(self, t, position):
         return jnp.abs(position[..., 0] + 0.3 * position[..., 1] - 1) / np.sqrt(1.09) - 5e-4
 
 
@@ -51,10 +51,10 @@ def test_balls_meet_a_post_and_a_thin_plate_as_geometry_says_however_fast():
     aside = np.linspace(0.0, 0.5, 40)
     speed = np.tile((100.0, 1000.0), 20)
     start = np.stack([np.full(40, -3.2), aside, 0 * aside], axis=-1)
-    body, hull = inertia.sphere(0.01, small), rigid.Hull.sphere(small)
+    body, hull = inertia.sphere(0.01, small), rigid.ContactPoints.sphere(small)
     touches = (
-        rigid.Touch(hull, contacts.Sphere((0.0, 0.0, 0.0), post)),
-        rigid.Touch(hull, contacts.Slab((plate, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3)),
+        rigid.SurfaceContact(hull, contacts.Sphere((0.0, 0.0, 0.0), post)),
+        rigid.SurfaceContact(hull, contacts.Slab((plate, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3)),
     )
     bodies = rigid.bodies(body, jnp.asarray(start), velocity=jnp.asarray(speed[:, None] * np.eye(3)[0]))
     dt = jnp.asarray(path / 3 / speed)  # five radii of the post a step
@@ -86,10 +86,10 @@ def test_no_corner_of_dice_and_rods_passes_a_thin_plate():
     place, velocity = np.zeros((n, 3)), rng.normal(size=(n, 3))
     place[:, 0], velocity[:, 0] = -0.6 - rng.uniform(0, 0.3, n), 3.0
     parts = (place, rng.normal(size=(n, 4)), velocity, rng.normal(size=(n, 3)) * 10)
-    box, hull = inertia.box(0.1, jnp.asarray(sizes)), rigid.Hull.box(jnp.asarray(sizes))
+    box, hull = inertia.box(0.1, jnp.asarray(sizes)), rigid.ContactPoints.box(jnp.asarray(sizes))
     plate = contacts.Slab((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3, restitution=0.8)
     bodies = rigid.bodies(box, *(jnp.asarray(part) for part in parts))
-    run = simulate(Scene(bodies, box, (), (rigid.Touch(hull, plate),)), methods.rk4, dt=1 / 60, steps=45)
+    run = simulate(Scene(bodies, box, (), (rigid.SurfaceContact(hull, plate),)), methods.rk4, dt=1 / 60, steps=45)
     corners = jax.vmap(lambda state: hull.arms(state) + state.position[None])(run.state)
     assert run.ok.all()
     assert float(corners[..., 0].max()) < -5e-4 + 1e-9
@@ -98,7 +98,7 @@ def test_no_corner_of_dice_and_rods_passes_a_thin_plate():
 def test_a_body_that_straddles_a_plate_is_refused():
     box = inertia.box(1.0, (0.4, 0.4, 0.4))
     plate = contacts.Slab((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3)
-    touch = rigid.Touch(rigid.Hull.box((0.4, 0.4, 0.4)), plate)
+    touch = rigid.SurfaceContact(rigid.ContactPoints.box((0.4, 0.4, 0.4)), plate)
     with pytest.raises(ValueError, match=r"on the wrong side, 0\.101 m deep"):
         Scene(rigid.bodies(box, (-0.1, 0.0, 0.0)), box, (), (touch,))
 
@@ -111,7 +111,9 @@ def test_balls_keep_to_mirror_images_in_a_room_its_edges_and_corners_too():
     x[0], v[0] = 0.5, 1.0
     room = contacts.Room((0.0, 0.0, 0.0), (side, side, side))
     bodies = rigid.bodies(BALL, jnp.asarray(x), velocity=jnp.asarray(v))
-    run = simulate(Scene(bodies, BALL, (), (rigid.Touch(HULL, room),)), methods.rk4, dt=0.01, steps=500, save_every=500)
+    run = simulate(
+        Scene(bodies, BALL, (), (rigid.SurfaceContact(HULL, room),)), methods.rk4, dt=0.01, steps=500, save_every=500
+    )
     width = side - 2 * r
     unfolded = np.mod(x - r + v * duration, 2 * width)
     right = r + np.where(unfolded > width, 2 * width - unfolded, unfolded)
@@ -127,7 +129,9 @@ def test_coupled_bodies_are_held_back_by_a_plate_and_lost_in_a_ball_that_they_pa
     through = contacts.Sphere((0.0, 0.0, 0.0), 0.3)
     stopped = contacts.Slab((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3)
     runs = [
-        simulate(Scene(bodies, BALL, (spring,), (rigid.Touch(HULL, surface),)), methods.rk4, dt=1 / 60, steps=3)
+        simulate(
+            Scene(bodies, BALL, (spring,), (rigid.SurfaceContact(HULL, surface),)), methods.rk4, dt=1 / 60, steps=3
+        )
         for surface in (through, stopped)
     ]
     assert runs[0].ok.tolist() == [False, True]
@@ -189,7 +193,7 @@ def bowl_errors(bowl):
     start = (R - r) * np.array([np.sin(swing), -np.cos(swing), 0.0])
     period = 4 * ellipk(np.sin(swing / 2) ** 2) * np.sqrt(7 * (R - r) / (5 * G))
     bodies = rigid.bodies(BALL, jnp.asarray(np.tile(start, (2, 1))))
-    scene = Scene(bodies, BALL, (forces.Gravity(G),), (rigid.Touch(HULL, bowl),))
+    scene = Scene(bodies, BALL, (forces.Gravity(G),), (rigid.SurfaceContact(HULL, bowl),))
     run = simulate(scene, methods.rk4, dt=jnp.array([period / 200, period / 100]), steps=200, save_every=200)
     return np.abs(np.asarray(run.position[-1]) - start).max(axis=-1)
 
@@ -217,13 +221,13 @@ def test_a_ball_rolls_off_a_globe_where_it_must():
     rough, v = contacts.Coulomb(50.0, 50.0), 0.6 * (R + r)
     globe = contacts.Sphere((0.0, 0.0, 0.0), R, restitution=0.0, coulomb=rough)
     body = rigid.bodies(BALL, (0.0, R + r, 0.0), velocity=(v, 0.0, 0.0), angular_velocity=(0.0, 0.0, -v / r))
-    scene = Scene(body, BALL, (forces.Gravity(G),), (rigid.Touch(HULL, globe),))
+    scene = Scene(body, BALL, (forces.Gravity(G),), (rigid.SurfaceContact(HULL, globe),))
     x = np.asarray(simulate(scene, methods.rk4, dt=1e-3, steps=900).position)
-    gap, leaves = np.linalg.norm(x, axis=-1) - R - r, 10 / 17 + 7 / 17 * v**2 / (G * (R + r))
+    signed_distance, leaves = np.linalg.norm(x, axis=-1) - R - r, 10 / 17 + 7 / 17 * v**2 / (G * (R + r))
     cosine = x[:, 1] / np.linalg.norm(x, axis=-1)
-    assert gap[cosine > leaves + 0.01].max() < 1e-9
-    assert gap[-1] > 1e-3
-    assert cosine[np.argmax(gap > 1e-6)] == pytest.approx(leaves, abs=0.03)
+    assert signed_distance[cosine > leaves + 0.01].max() < 1e-9
+    assert signed_distance[-1] > 1e-3
+    assert cosine[np.argmax(signed_distance > 1e-6)] == pytest.approx(leaves, abs=0.03)
 
 
 @pytest.mark.slow
@@ -237,10 +241,10 @@ def test_a_particle_leaves_a_crest_of_ones_own_where_it_must():
     ]
     own, ours = (np.asarray(simulate(scene, methods.rk4, dt=2e-3, steps=400).position) for scene in scenes)
     np.testing.assert_allclose(own, ours, atol=1e-12)
-    gap, leaves = np.linalg.norm(own, axis=-1) - R, 2 / 3 + v**2 / (3 * G * R)
+    signed_distance, leaves = np.linalg.norm(own, axis=-1) - R, 2 / 3 + v**2 / (3 * G * R)
     cosine = own[:, 1] / np.linalg.norm(own, axis=-1)
-    assert gap[cosine > leaves + 1e-3].max() < 1e-9
-    assert gap[-1] > 0.01
+    assert signed_distance[cosine > leaves + 1e-3].max() < 1e-9
+    assert signed_distance[-1] > 0.01
 
 
 def test_shapes_follow_from_their_signed_distance():
@@ -248,8 +252,10 @@ def test_shapes_follow_from_their_signed_distance():
     rng = np.random.default_rng(0)
     x, v = (jnp.asarray(rng.normal(size=(5, 3))) for _ in range(2))
     for own, ours in ((Globe(), contacts.Sphere((0.0, 0.0, 0.0), R)), (Bowl(), contacts.Sphere((0.0,) * 3, R, True))):
-        np.testing.assert_allclose(own.outward(0.0, x), ours.outward(0.0, x), atol=1e-14)
-        np.testing.assert_allclose(own.bend(0.0, x, v), ours.bend(0.0, x, v), atol=1e-13)
+        np.testing.assert_allclose(own.normal_at(0.0, x), ours.normal_at(0.0, x), atol=1e-14)
+        np.testing.assert_allclose(
+            own.curvature_acceleration(0.0, x, v), ours.curvature_acceleration(0.0, x, v), atol=1e-13
+        )
         np.testing.assert_allclose(own.normal_rate(0.0, x, v), ours.normal_rate(0.0, x, v), atol=1e-13)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from physjax import Particles, Scene, contacts, forces, methods, simulate
 from physjax.scene import as_module
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import sample_states
 
 SECOND_ORDER = (methods.verlet, methods.midpoint, methods.rk4)
 G = 9.8
@@ -89,7 +89,7 @@ def test_at_the_bound_of_touches_a_lane_waits_and_keeps_its_energy():
 def end_after_a_bounce(method, steps, response):
     drag = forces.QuadraticDrag(area=0.02, coefficient=0.5)
     scene = dropped(np.linspace(0.7, 1.3, 48), (2.0, 0.0), (drag,), 0.05, restitution=0.7, response=response)
-    states = sample(scene, as_module(method), jnp.asarray(0.75 / steps), jnp.asarray(steps), 1)  # compiles once
+    states = sample_states(scene, as_module(method), jnp.asarray(0.75 / steps), jnp.asarray(steps), 1)  # compiles once
     return np.asarray(states.position[-1])
 
 
@@ -257,7 +257,7 @@ def test_a_ball_comes_to_rest_in_a_wedge():
     sides = [contacts.Plane((0.0, 0.0), (s, 1.0), restitution=0.4, coulomb=contacts.Coulomb(0.3, 0.2)) for s in (1, -1)]
     ball = Scene(Particles(jnp.asarray([0.1, 1.0]), jnp.zeros(2)), forces=(forces.Gravity(G),), contacts=tuple(sides))
     flight = simulate(ball, methods.verlet, dt=1e-2, steps=2000)
-    assert min(float(side.gap(0.0, flight.position).min()) for side in sides) > -1e-12
+    assert min(float(side.signed_distance(0.0, flight.position).min()) for side in sides) > -1e-12
     np.testing.assert_array_equal(flight.velocity[-100:], 0.0)
     assert np.ptp(np.asarray(flight.position[-1000:]), axis=0).max() < 1e-12
     rests = [float(side.touching_since) for side in flight.final_scene.contacts]
@@ -336,7 +336,7 @@ def test_a_fast_particle_does_not_tunnel(obstacle, precision):
     end = last(scene, methods.verlet, dt=1 / 60, steps=1).state
     turned = np.abs(np.asarray(end.velocity) - np.asarray(v)).max(axis=-1)
     assert np.all(turned > 100), "every one of them must have been turned"
-    assert float(scene.contacts[0].gap(0.0, end.position).min()) > 0
+    assert float(scene.contacts[0].signed_distance(0.0, end.position).min()) > 0
 
 
 def test_a_ball_between_two_pistons_is_heated():
@@ -349,8 +349,8 @@ def test_a_ball_between_two_pistons_is_heated():
     # each bounce adds 0.2 m/s; first at 1/1.1 s
     t, x, v, side = 0.0, 0.0, 1.0, 1
     while True:
-        gap = (1 - 0.1 * t) - side * x
-        hit = t + gap / (abs(v) + 0.1)
+        signed_distance = (1 - 0.1 * t) - side * x
+        hit = t + signed_distance / (abs(v) + 0.1)
         if hit > 3.0:
             break
         x, t, v, side = x + v * (hit - t), hit, -v - np.sign(v) * 0.2, -side

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, contacts, emitters, forces, methods, simulate
-from physjax.backend import FEWEST
+from physjax.backend import MIN_LANES_TO_SELECT
 
 UP = (0.0, 1.0, 0.0)
 HALF = (0.0, 0.5, 0.0)
@@ -78,7 +78,7 @@ def test_births_are_the_same_at_every_step_size():
 @pytest.mark.slow
 @pytest.mark.parametrize("pool", [900, 3000])
 def test_a_run_resumed_at_any_frame_has_the_same_bits(precision, pool):
-    floor = FLOOR if pool < FEWEST else LECTURE
+    floor = FLOOR if pool < MIN_LANES_TO_SELECT else LECTURE
     scene = spray(fountain(pool, rate=0.8 * pool), touched=(floor,), dtype=precision.dtype)
     whole = simulate(scene, methods.rk4, dt=0.02, steps=90, save_every=10)
     first = simulate(scene, methods.rk4, dt=0.02, steps=30, save_every=10)
@@ -326,4 +326,4 @@ def test_saved_and_read_again(tmp_path):
 
 def test_enough_particles_were_tried():
     """Windows slide over pools as large as this; smaller ones are done whole."""
-    assert 1000 < FEWEST < 1200
+    assert 1000 < MIN_LANES_TO_SELECT < 1200

@@ -33,7 +33,7 @@ def test_every_lane_gets_the_impulse_of_its_distance(method, precision):
 def test_half_of_it_arrives_at_the_reach_and_it_thins_as_a_wave_that_spreads():
     blast = forces.Blast((0.0, 0.0), 4.0, 2.0, at=0.0, duration=1.0)
     x = jnp.array([[2.0, 0.0], [0.0, -2e6], [0.0, 1e-9]])
-    got = np.asarray(blast.received(Particles(x, x)))
+    got = np.asarray(blast.lane_impulse(Particles(x, x)))
     np.testing.assert_allclose(got, [[2.0, 0], [0, -4.0 / 1e12], [0, 4.0]], rtol=1e-11)
 
 

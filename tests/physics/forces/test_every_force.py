@@ -118,8 +118,8 @@ def test_value_and_derivatives_are_finite_at_rest_and_at_nothing(case):
         def weighed(scene):
             t = jnp.zeros((), jnp.float32)
             parts = [scene.acceleration(t, scene.state)]
-            if hasattr(scene.forces[0], "during"):
-                parts += [scene.during(t, t + 0.1).acceleration(t, scene.state)]
+            if hasattr(scene.forces[0], "averaged_over_step"):
+                parts += [scene.averaged_over_step(t, t + 0.1).acceleration(t, scene.state)]
             return sum(jnp.vdot(part, jnp.arange(1.0, 1 + part.size, dtype=part.dtype)) for part in parts)
 
         return jax.jvp(jax.value_and_grad(weighed), (scene,), (jax.tree.map(jnp.ones_like, scene),))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, forces, methods, simulate
-from physjax.physics.forces.gravitation import TILE
+from physjax.physics.forces.gravitation import SOURCES_PER_TILE
 
 
 def bodies(*shape, dtype=float, seed=0):
@@ -40,7 +40,15 @@ def by_hand(x, gm, softening=0.0):
 
 # fewer bodies than a tile, one tile, one more, some tiles, and a part of one
 @pytest.mark.parametrize(
-    ("n", "softening"), [(2, None), (5, 0.3), (TILE, None), (TILE + 1, 0.3), (3 * TILE, 0.3), (3 * TILE + 7, None)]
+    ("n", "softening"),
+    [
+        (2, None),
+        (5, 0.3),
+        (SOURCES_PER_TILE, None),
+        (SOURCES_PER_TILE + 1, 0.3),
+        (3 * SOURCES_PER_TILE, 0.3),
+        (3 * SOURCES_PER_TILE + 7, None),
+    ],
 )
 def test_tiles_equal_the_sum_over_all_pairs(n, softening, precision):
     x, gm = bodies(n, 3, dtype=precision.dtype)
@@ -52,7 +60,7 @@ def test_tiles_equal_the_sum_over_all_pairs(n, softening, precision):
     np.testing.assert_allclose(energy, potential, rtol=(4 + math.sqrt(n)) * precision.eps, atol=0)
 
 
-@pytest.mark.parametrize(("n", "softening"), [(5, None), (TILE + 7, 0.3)])
+@pytest.mark.parametrize(("n", "softening"), [(5, None), (SOURCES_PER_TILE + 7, 0.3)])
 def test_the_force_is_minus_the_gradient_of_the_total_energy(n, softening):
     x, mass = bodies(n, 2)
     force = forces.Gravitation(G=0.7, softening=softening)
@@ -61,7 +69,7 @@ def test_the_force_is_minus_the_gradient_of_the_total_energy(n, softening):
     np.testing.assert_allclose(-slope, newtons, rtol=0, atol=1e-14 * np.abs(newtons).max())
 
 
-@pytest.mark.parametrize("n", [5, TILE + 7])
+@pytest.mark.parametrize("n", [5, SOURCES_PER_TILE + 7])
 def test_action_equals_reaction(n, precision):
     x, mass = bodies(n, 3, dtype=precision.dtype)
     newtons = mass[:, None].astype(float) * np.asarray(
@@ -104,7 +112,7 @@ def test_two_bodies_return_after_keplers_period():
     np.testing.assert_allclose(flight.position[2], x, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(("n", "softening"), [(4, 0.3), (TILE + 7, None)])
+@pytest.mark.parametrize(("n", "softening"), [(4, 0.3), (SOURCES_PER_TILE + 7, None)])
 def test_coincident_bodies_do_not_act_on_each_other_and_everything_stays_finite(n, softening):
     x, gm = bodies(n, 3, dtype=np.float32)
     x[[0, 1, 2, -1]] = 0.0
@@ -128,7 +136,7 @@ def test_coincident_bodies_do_not_act_on_each_other_and_everything_stays_finite(
 
 def test_a_body_beside_the_origin_keeps_its_gradient_where_tiles_are_filled_up():
     with jax.enable_x64(False):
-        x, gm = bodies(TILE + 7, 2, dtype=np.float32)
+        x, gm = bodies(SOURCES_PER_TILE + 7, 2, dtype=np.float32)
         x[0] = 1e-13, 0.0
         force = forces.Gravitation(gm=gm)
         slope = jax.jit(jax.grad(lambda x: jnp.sum(attraction(force, x) ** 2)))(jnp.asarray(x))
@@ -149,7 +157,7 @@ def test_float32_is_enough_for_gradients_across_the_solar_system(distance):
 
 
 def test_scenes_side_by_side_do_not_see_each_other():
-    x, mass = map(jnp.asarray, bodies(3, TILE + 7, 3))
+    x, mass = map(jnp.asarray, bodies(3, SOURCES_PER_TILE + 7, 3))
     force = forces.Gravitation(G=0.7, softening=0.05)
     ways = jax.jit(
         lambda *a: (attraction_and_energy(force, *a), jax.vmap(lambda *b: attraction_and_energy(force, *b))(*a))

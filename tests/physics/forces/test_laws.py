@@ -110,7 +110,7 @@ def test_a_kick_knows_the_time_of_each_scene():
     kick = forces.Kick(np.array([6.0, 0.0]), at=np.array([[0.0, 1.0, 2.0]] * 2), duration=0.5)
     state, t = ball(np.zeros((2, 3, 2))), jnp.asarray([0.25, 2.25])
     np.testing.assert_array_equal(push(kick, state, t=t)[..., 0], [[12, 0, 0], [0, 0, 12]])
-    mean = kick.during(t, jnp.asarray([1.0, 0.125]), state)
+    mean = kick.averaged_over_step(t, jnp.asarray([1.0, 0.125]), state)
     np.testing.assert_array_equal(push(mean, state)[..., 0], [[3, 3, 0], [0, 0, 12]])
 
 
@@ -250,7 +250,7 @@ def test_the_displaced_volume_is_that_of_the_cap_below_the_surface():
     volume = np.pi * h**2 * (3 * r - h) / 3
     ball_in = ball(np.stack([0 * y, y], axis=-1))
     water = forces.Buoyancy(density=1000.0, radius=r, surface=surface)
-    np.testing.assert_allclose(water.displaced(ball_in), volume, rtol=1e-15)
+    np.testing.assert_allclose(water.displaced_volume(ball_in), volume, rtol=1e-15)
     np.testing.assert_allclose(volume[[0, 1, 3, 5, 6]], 4 / 3 * np.pi * r**3 * np.array([0, 0, 0.5, 1, 1]), rtol=1e-15)
     np.testing.assert_allclose(push(water, ball_in), np.outer(1000 * G * volume, [0, 1]), rtol=1e-14)
 

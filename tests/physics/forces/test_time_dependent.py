@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, contacts, emitters, forces, inertia, methods, rigid, simulate
-from physjax.loops import LAST_STEP, exact_multiple, exact_quotient, moment_at, rest_in, rest_of
+from physjax.loops import LAST_STEP, cast_remainder, exact_multiple, exact_quotient, float32_remainder, moment_at
 
 DT = 1 / 120
 AGAIN = 2**24
@@ -62,7 +62,7 @@ def test_a_kick_is_where_it_is_asked_for_within_its_step():
         scene = Scene(Particles(jnp.zeros(1), jnp.zeros(1)), forces=(kick,))
         assert scene.forces[0].at.dtype == jnp.float32
         seen = [
-            scene.during(moment_at(jnp.int32(first + i), jnp.float32(DT), np.dtype(np.float32)), STEP / 4)
+            scene.averaged_over_step(moment_at(jnp.int32(first + i), jnp.float32(DT), np.dtype(np.float32)), STEP / 4)
             for i in (0, 1)
         ]
         return [float(part.forces[0].force[0]) * STEP / 4 for part in seen]
@@ -117,8 +117,8 @@ def test_a_belt_carries_a_box_alike_at_any_time_of_day(first):
     belt = contacts.Plane(np.zeros(3), (*up, 0.0), velocity=(*(v * along), 0.0), **dry)
     brick, turn = inertia.box(1.0, (side, side, side)), (np.cos(slope / 2), 0.0, 0.0, np.sin(slope / 2))
     body = rigid.bodies(brick, (*(up * side / 2 * 1.0001), 0.0), turn, (*(v * along), 0.0))
-    hull = rigid.Hull.box((side, side, side))
-    scene = Scene(body, brick, (forces.Gravity(),), (rigid.Touch(hull, belt),))
+    hull = rigid.ContactPoints.box((side, side, side))
+    scene = Scene(body, brick, (forces.Gravity(),), (rigid.SurfaceContact(hull, belt),))
     x = np.asarray(simulate(scene, methods.rk4, dt=DT, steps=120, save_every=12, first_step=first).position, float)
     assert np.abs(x[:, :2] @ up - side / 2).max() < 5e-5
     assert abs(x[-1, :2] @ along - v * 120 * DT) < 1e-3
@@ -128,8 +128,8 @@ def test_what_moves_along_its_normal_moves_and_is_differentiated():
     """Rounding of a velocity along the surface is none; a slow speed of the surface's own is kept, and so is its slope."""
     place = jnp.asarray([3.0, 1.0])
     lift = contacts.Plane((0.0, 0.0), (0.0, 1.0), velocity=(10.0, 1e-6))
-    assert float(lift.gap(1000.0, place)) == np.float32(1.0) - np.float32(1e-3)
-    belt = lambda v: contacts.Plane((0.0, 0.0), (-0.6, 0.8), velocity=v).gap(1000.0, place)  # noqa: E731
+    assert float(lift.signed_distance(1000.0, place)) == np.float32(1.0) - np.float32(1e-3)
+    belt = lambda v: contacts.Plane((0.0, 0.0), (-0.6, 0.8), velocity=v).signed_distance(1000.0, place)  # noqa: E731
     assert float(belt(jnp.asarray([0.8, 0.6]) * 3)) == pytest.approx(-1.0)
     np.testing.assert_allclose(jax.grad(belt)(jnp.asarray([0.8, 0.6])), [600.0, -800.0], rtol=1e-6)
 
@@ -188,10 +188,10 @@ def test_products_and_quotients_of_a_count_leave_out_nothing():
 def test_the_rest_of_a_number_follows_it_or_is_dropped():
     """It is of a number that is given in float64, and none of one that was put in its place or is float64 itself."""
     at = 86400.503
-    whole, rest = jnp.float32(at), rest_of(at)
-    assert float(np.float64(whole) + np.float64(rest_in(whole, rest))) == pytest.approx(at, abs=1e-9)
-    assert float(rest_in(jnp.float32(1.0), rest)) == 0.0
-    assert float(rest_of(jnp.float32(0.1))) == 0.0
+    whole, rest = jnp.float32(at), float32_remainder(at)
+    assert float(np.float64(whole) + np.float64(cast_remainder(whole, rest))) == pytest.approx(at, abs=1e-9)
+    assert float(cast_remainder(jnp.float32(1.0), rest)) == 0.0
+    assert float(float32_remainder(jnp.float32(0.1))) == 0.0
     with jax.enable_x64(True):
-        assert float(rest_in(jnp.float64(at), rest)) == 0.0
-        assert float(jax.jit(rest_of)(jnp.float64(at))) == float(rest)
+        assert float(cast_remainder(jnp.float64(at), rest)) == 0.0
+        assert float(jax.jit(float32_remainder)(jnp.float64(at))) == float(rest)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physjax import Inertia, inertia
-from physjax.vectors import turn
+from physjax.vectors import rotate_vector
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 CUBE_FACES = np.array(
@@ -57,8 +57,10 @@ def test_a_shell_is_what_a_ball_gains_by_growing():
 
 def test_a_mesh_of_a_cube_is_the_cube_wherever_it_is_and_however_it_is_turned():
     for turned_by, place in (([1.0, 0, 0, 0], (0, 0, 0)), (TILT, (5.0, -3.0, 100.0))):
-        corners = np.asarray(turn(jnp.asarray([turned_by] * 8, float), jnp.asarray(CUBE * [1.0, 2.0, 0.6]))) + place
-        middle = np.asarray(turn(jnp.asarray(turned_by, float), jnp.asarray([0.5, 1.0, 0.3]))) + place
+        corners = (
+            np.asarray(rotate_vector(jnp.asarray([turned_by] * 8, float), jnp.asarray(CUBE * [1.0, 2.0, 0.6]))) + place
+        )
+        middle = np.asarray(rotate_vector(jnp.asarray(turned_by, float), jnp.asarray([0.5, 1.0, 0.3]))) + place
         found = inertia.mesh(corners, CUBE_FACES, density=2.5)
         np.testing.assert_allclose(found.inertia.mass, 3.0, rtol=1e-12)
         np.testing.assert_allclose(found.center, middle, rtol=1e-13)

@@ -58,7 +58,7 @@ def test_a_hinge_turns_about_its_axis_alone():
 def test_a_chain_that_falls_on_the_floor_runs_adaptively_too():
     scene, _ = chain(n=2, damping=300.0, acting=(forces.Gravity(),), orientation=(1.0, 0.0, 0.0, 0.1))
     floor = contacts.Plane((0.0, -0.7, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(0.5, 0.5))
-    scene = scene.having(contacts=(rigid.Touch(rigid.Hull.box((0.05, 0.4, 0.05)), floor),))
+    scene = scene.replace(contacts=(rigid.SurfaceContact(rigid.ContactPoints.box((0.05, 0.4, 0.05)), floor),))
     fine = simulate(scene, methods.rk4, dt=2e-4, steps=1500, save_every=1500)
     own = simulate(scene, methods.adaptive(methods.rk4, 1e-8, 1e-8), dt=2e-3, steps=150, save_every=150)
     assert own.ok

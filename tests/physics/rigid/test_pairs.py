@@ -52,12 +52,12 @@ def test_friction_between_balls_stops_the_slip_it_can():
 def test_balls_hit_each_other_and_the_floor():
     floor = contacts.Plane((0, 0, 0), (0, 1, 0), restitution=0.5)
     place = np.array([[0.0, 0.2, 0], [0.001, 0.3, 0], [0.0, 0.4, 0.001]])
-    more = (rigid.Touch(rigid.Hull.sphere(0.03), floor),)
+    more = (rigid.SurfaceContact(rigid.ContactPoints.sphere(0.03), floor),)
     pile = billiards(place, (0.0, 0, 0), acting=(forces.Gravity(),), more=more, restitution=0.5)
     film = simulate(pile, methods.rk4, dt=2e-3, steps=1000, save_every=50)
     assert film.ok.all()
     assert film.position[-1, :, 1].min() > 0.03 - 1e-6
-    assert np.asarray(pile.contacts[0].gap(0.0, film.position[-1])).min() > -1e-6
+    assert np.asarray(pile.contacts[0].signed_distance(0.0, film.position[-1])).min() > -1e-6
 
 
 @pytest.mark.usefixtures("unannotated")

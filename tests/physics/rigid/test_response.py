@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from physjax import Particles, RigidBodies, Scene, contacts, energy, forces, inertia, methods, rigid, simulate
-from physjax.physics.rigid.impulses import Points, impulses
+from physjax.physics.rigid.impulses import Points, apply_contact_impulses
 
 SIZE = (0.4, 0.2, 0.3)
-BOX, CORNERS = inertia.box(2.0, SIZE), rigid.Hull.box(SIZE)
+BOX, CORNERS = inertia.box(2.0, SIZE), rigid.ContactPoints.box(SIZE)
 UP = (0.0, 1.0, 0.0)
 TILT = (0.9, 0.3, 0.2, 0.1)
 
@@ -23,7 +23,7 @@ def floor(restitution=0.0, friction=None, **options):
 
 def dropped(surface, height=0.4, **start):
     state = rigid.bodies(BOX, (0.0, height, 0.0), TILT, **start)
-    return Scene(state, BOX, (forces.Gravity(),), (rigid.Touch(CORNERS, surface),))
+    return Scene(state, BOX, (forces.Gravity(),), (rigid.SurfaceContact(CORNERS, surface),))
 
 
 def told(scene, film):
@@ -46,7 +46,7 @@ def test_no_impulses_at_any_points_add_energy():
     mu = jnp.asarray(rng.uniform(0, 2, (k, n)))
     points = Points(arm, jnp.asarray(normal), jnp.asarray(velocity), (1.3 * mu, mu))
     active = jnp.asarray(rng.random((k, n)) < 0.7)
-    after, push = jax.jit(impulses)(points, active, state, body, jnp.asarray(rng.uniform(0, 1, (k, n))))
+    after, push = jax.jit(apply_contact_impulses)(points, active, state, body, jnp.asarray(rng.uniform(0, 1, (k, n))))
     change = after.kinetic_energy(body) / state.kinetic_energy(body) - 1
     assert change.max() <= 1e-12
     assert change.min() < -0.9  # much is lost
@@ -69,12 +69,12 @@ def test_a_thousand_random_drops_never_gain_energy():
     def gain(lanes, dt, each):
         pick = lambda tree: jax.tree.map(lambda leaf: leaf[lanes], tree)  # noqa: E731
         ground = floor(jnp.asarray(bounce[lanes]), jnp.asarray(rough[lanes]))
-        touch = rigid.Touch(rigid.Hull.box(size[lanes]), ground)
+        touch = rigid.SurfaceContact(rigid.ContactPoints.box(size[lanes]), ground)
         scene = Scene(pick(start), pick(body), (forces.Gravity(),), (touch,))
         film = simulate(scene, methods.rk4, dt=dt, steps=80 * each, save_every=each)
         assert film.ok.all()
-        gap = jax.vmap(lambda state: touch.clearance(0.0, state))(film.state)
-        assert gap.min() > -1e-5
+        signed_distance = jax.vmap(lambda state: touch.clearance(0.0, state))(film.state)
+        assert signed_distance.min() > -1e-5
         e = told(scene, film)
         assert (e[-1] / e[0]).mean() < 0.8
         return (e / e[0]).max(axis=0) - 1
@@ -114,7 +114,7 @@ def test_friction_holds_a_box_on_a_slope_up_to_its_angle_and_not_beyond(share):
     turn = (math.cos(angle / 2), 0.0, 0.0, -math.sin(angle / 2))
     slope = contacts.Plane((0.0, 0.0, 0.0), up, coulomb=contacts.Coulomb(mu, mu))
     start = rigid.bodies(BOX, SIZE[1] / 2 * up, turn)
-    scene = Scene(start, BOX, (forces.Gravity(),), (rigid.Touch(CORNERS, slope),))
+    scene = Scene(start, BOX, (forces.Gravity(),), (rigid.SurfaceContact(CORNERS, slope),))
     film = simulate(scene, methods.verlet, dt=2e-3, steps=500, save_every=500)
     way = np.linalg.norm(film.position[-1] - film.position[0])
     pull = max(9.8 * (math.sin(angle) - mu * math.cos(angle)), 0.0)
@@ -126,7 +126,10 @@ def test_a_belt_takes_a_ball_along():
     ball = inertia.sphere(1.0, 0.1)
     belt = floor(0.0, 0.5, velocity=(2.0, 0.0, 0.0))
     scene = Scene(
-        rigid.bodies(ball, (0, 0.1, 0)), ball, (forces.Gravity(),), (rigid.Touch(rigid.Hull.sphere(0.1), belt),)
+        rigid.bodies(ball, (0, 0.1, 0)),
+        ball,
+        (forces.Gravity(),),
+        (rigid.SurfaceContact(rigid.ContactPoints.sphere(0.1), belt),),
     )
     end = simulate(scene, methods.rk4, dt=0.01, steps=100, save_every=100).final_scene.state
     np.testing.assert_allclose(end.momentum, [2 * 2 / 7, 0, 0], atol=1e-9)
@@ -161,24 +164,24 @@ def test_gradients_through_an_impact_agree_with_differences(derivative):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: rigid.Hull(jnp.zeros(3)), "A ball is Hull.sphere"),
-        (lambda: rigid.Hull.sphere(0.0), "numbers > 0"),
-        (lambda: rigid.Hull.capsule(0.1, 1.0, axis=3), "expected 0, 1 or 2"),
-        (lambda: rigid.Touch(floor(), CORNERS), "expected a Hull"),
-        (lambda: rigid.Touch(CORNERS, 0.0), "expected a Surface"),
-        (lambda: rigid.Touch(CORNERS, contacts.Plane((0, 0, 0), UP, friction=0.1)), "coulomb="),
+        (lambda: rigid.ContactPoints(jnp.zeros(3)), "A ball is Hull.sphere"),
+        (lambda: rigid.ContactPoints.sphere(0.0), "numbers > 0"),
+        (lambda: rigid.ContactPoints.capsule(0.1, 1.0, axis=3), "expected 0, 1 or 2"),
+        (lambda: rigid.SurfaceContact(floor(), CORNERS), "expected a Hull"),
+        (lambda: rigid.SurfaceContact(CORNERS, 0.0), "expected a Surface"),
+        (lambda: rigid.SurfaceContact(CORNERS, contacts.Plane((0, 0, 0), UP, friction=0.1)), "coulomb="),
         (lambda: dropped(floor(), height=0.1), "on the wrong side"),
-        (lambda: Scene(Particles(jnp.zeros(3), jnp.zeros(3)), contacts=(rigid.Touch(CORNERS, floor()),)), "expected RigidBodies"),
+        (lambda: Scene(Particles(jnp.zeros(3), jnp.zeros(3)), contacts=(rigid.SurfaceContact(CORNERS, floor()),)), "expected RigidBodies"),
         (lambda: Scene(dropped(floor()).state, BOX, contacts=(floor(),)), "rigid.Touch"),
         (
             lambda: Scene(
-                RigidBodies(*dropped(floor()).state), BOX, contacts=(rigid.Touch(rigid.Hull(jnp.zeros((4, 2, 3))), floor()),)
+                RigidBodies(*dropped(floor()).state), BOX, contacts=(rigid.SurfaceContact(rigid.ContactPoints(jnp.zeros((4, 2, 3))), floor()),)
             ),
             r"expected a vector of shape \(n, 3\) for all lanes",
         ),
         (
             lambda: Scene(
-                dropped(floor()).state, BOX.about((0.0, 0.1, 0.0)), contacts=(rigid.Touch(CORNERS, floor()),)
+                dropped(floor()).state, BOX.about((0.0, 0.1, 0.0)), contacts=(rigid.SurfaceContact(CORNERS, floor()),)
             ),
             "pivot",
         ),

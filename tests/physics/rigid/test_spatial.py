@@ -27,9 +27,9 @@ from physjax import (
 )
 from physjax.scene import as_module
 from physjax.stepping.methods import METHODS
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import sample_states
 from physjax.study import energy
-from physjax.vectors import norm, turn, turn_back
+from physjax.vectors import norm, rotate_vector, rotate_vector_back
 
 ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 BRICK = inertia.box(2.0, (1.0, 2.0, 3.0))
@@ -52,7 +52,9 @@ def truth(name):
 def errors(name, method, counts):
     """The error of the orientation after two seconds, for runs with so many steps."""
     scene, true = SCENES[name], truth(name)
-    ends = [sample(scene, as_module(method), jnp.asarray(2.0 / n), jnp.asarray(n), 1).orientation[-1] for n in counts]
+    ends = [
+        sample_states(scene, as_module(method), jnp.asarray(2.0 / n), jnp.asarray(n), 1).orientation[-1] for n in counts
+    ]
     return np.array([angle(q, true).max() for q in ends])
 
 
@@ -145,7 +147,7 @@ def test_a_constant_torque_spins_up_evenly(method):
 def test_a_pivot_never_moves_and_the_body_falls_as_newton_says():
     for method in (methods.euler, methods.rk4):
         film = simulate(HUNG, method, dt=0.01, steps=500, save_every=10)
-        pivot = film.position - np.asarray(turn(film.state.orientation, jnp.tile(HUNG.mass.arm, (51, 1))))
+        pivot = film.position - np.asarray(rotate_vector(film.state.orientation, jnp.tile(HUNG.mass.arm, (51, 1))))
         np.testing.assert_allclose(pivot, np.tile(pivot[:1], (51, 1)), rtol=0, atol=1e-12)
         still = jax.vmap(lambda s: rigid.point_velocity(s, HUNG.mass, (0.2, 0.5, -0.3)))(film.state)
         np.testing.assert_allclose(still, 0, atol=1e-12)
@@ -168,8 +170,8 @@ def test_the_body_feels_eulers_equations():
     principal, omega = np.asarray(BRICK.principal), np.array(OMEGA)
     seen = (torque - np.cross(omega, principal * omega)) / principal
     state = rigid.bodies(BRICK, orientation=TILT, angular_velocity=omega, frame="body")
-    found = rigid.angular_acceleration(state, BRICK, turn(state.orientation, jnp.asarray(torque)))
-    np.testing.assert_allclose(turn_back(state.orientation, found), seen, rtol=1e-13)
+    found = rigid.angular_acceleration(state, BRICK, rotate_vector(state.orientation, jnp.asarray(torque)))
+    np.testing.assert_allclose(rotate_vector_back(state.orientation, found), seen, rtol=1e-13)
 
     def euler(t, omega, args):
         i, w = jnp.asarray(principal), omega
@@ -183,7 +185,7 @@ def test_the_body_feels_eulers_equations():
     ).ys[-1]  # fmt: skip
     end = reference(Scene(state, BRICK, (rigid.Torque(torque, "body"),)), [2.0], rtol=1e-12, atol=1e-12).state
     last = RigidBodies(*(jnp.asarray(a[-1]) for a in end))
-    found = turn_back(last.orientation, rigid.angular_velocity(last, BRICK))
+    found = rotate_vector_back(last.orientation, rigid.angular_velocity(last, BRICK))
     np.testing.assert_allclose(found, told, rtol=0, atol=1e-9)
 
 
@@ -333,7 +335,7 @@ def test_held_bodies_stay_and_a_sick_lane_harms_no_other():
     scene = Scene(
         rigid.bodies(BRICK, x, angular_velocity=OMEGA), BRICK, (forces.Gravity(),), pinned=jnp.asarray([True, False, False])
     )  # fmt: skip
-    sick = scene.having(
+    sick = scene.replace(
         state=scene.state._replace(momentum=scene.state.momentum * jnp.asarray([[1.0], [1.0], [jnp.nan]]))
     )
     film = simulate(sick, methods.rk4, dt=0.01, steps=10)

@@ -7,9 +7,9 @@ import pytest
 
 from physjax import Particles, Scene, accuracy, contacts, emitters, forces, lattices, methods, reference, simulate
 from physjax.scenes import SCENES
-from physjax.scenes.registry import table
-from physjax.study.ablation.ablate import BLURRED, COSTLY, NEEDED, NEGLIGIBLE, NONE, _verdicts
-from physjax.study.ablation.variants import removals, two_at_once
+from physjax.scenes.registry import read_table
+from physjax.study.ablation.ablate import COSTLY, NEEDED, NEGLIGIBLE, NONE, UNRESOLVED, _judge_entries
+from physjax.study.ablation.variants import list_pair_variants, list_variants
 
 UNTIMED = {"seconds": 0.0}
 YEAR = 365.25 * 86400.0
@@ -33,7 +33,7 @@ def test_which_law_of_drag_a_raindrop_needs_at_which_size():
         SCENES["raindrop"]().scene, lambda f: f.velocity[-1, :, 0], method=methods.rk4, dt=0.01, duration=6.0, error=0.25,
         save_every=600, **UNTIMED,
     )  # fmt: skip
-    diameter = table("raindrop_terminal_velocity.csv")["diameter_mm"]
+    diameter = read_table("raindrop_terminal_velocity.csv")["diameter_mm"]
     stokes, fast = told["SphereDrag: Stokes' law instead"], told["SphereDrag: quadratic law instead"]
     # creeping flow ends at 0.1 mm; a constant coefficient fits no small drop
     assert (stokes.verdicts[diameter <= 0.1] == NEGLIGIBLE).all()
@@ -51,7 +51,7 @@ def test_which_law_of_drag_a_raindrop_needs_at_which_size():
 @pytest.mark.slow
 def test_which_planets_matter_to_the_earth_to_one_kilometre_over_a_year():
     scene = SCENES["solar_system"]().scene
-    names = table("solar_system_de421.csv")["body"][: scene.state.lanes[0]].tolist()
+    names = read_table("solar_system_de421.csv")["body"][: scene.state.lanes[0]].tolist()
     earth, sun = names.index("earthmoon"), names.index("sun")
 
     def from_the_sun(flight):
@@ -151,9 +151,9 @@ def test_the_third_dimension_stays_where_something_leaves_the_plane():
 
 
 def test_a_verdict_weighs_the_change_against_what_counts_and_what_is_numerical():
-    change, numerical, matters = np.array([1e-9, 1e-4, 1.0, np.nan]), np.full(4, 1e-6), np.full(4, 1e-3)
-    assert _verdicts(change, numerical, numerical, matters, False).tolist() == [NONE, NEGLIGIBLE, NEEDED, NEEDED]
-    assert _verdicts(change, numerical, numerical, matters, True).tolist() == [NONE, COSTLY, NEEDED, NEEDED]
+    change, numerical, threshold = np.array([1e-9, 1e-4, 1.0, np.nan]), np.full(4, 1e-6), np.full(4, 1e-3)
+    assert _judge_entries(change, numerical, numerical, threshold, False).tolist() == [NONE, NEGLIGIBLE, NEEDED, NEEDED]
+    assert _judge_entries(change, numerical, numerical, threshold, True).tolist() == [NONE, COSTLY, NEEDED, NEEDED]
 
 
 @pytest.mark.slow
@@ -176,10 +176,10 @@ def test_times_are_taken_side_by_side_and_what_costs_is_told():
 def test_what_may_be_left_out_alone_and_two_at_once():
     floor = contacts.Plane((0.0, 0.0), (0.0, 1.0))
     scene = Scene(Particles(jnp.zeros(2), jnp.ones(2)), 1.0, (forces.Gravity(), forces.StokesDrag(0.1)), (floor,))
-    alone, notes = removals(scene, simulate(scene, methods.rk4, dt=0.1, steps=2), {})
+    alone, notes = list_variants(scene, simulate(scene, methods.rk4, dt=0.1, steps=2), {})
     assert [r.name for r in alone] == ["Gravity", "StokesDrag", "Plane", "Plane: timing of impacts"]
     assert notes == []
-    found = two_at_once(scene)
+    found = list_pair_variants(scene)
     assert [r.name for r in found] == ["Gravity and StokesDrag", "Gravity and Plane", "StokesDrag and Plane"]
     assert [(len(r.scene.forces), len(r.scene.contacts)) for r in found] == [(0, 1), (1, 0), (1, 0)]
 
@@ -202,4 +202,4 @@ def test_damping_that_keeps_a_method_stable_is_not_called_none():
         swing, lambda f: f.position[-1], method=methods.euler, dt=0.05, duration=10.0, scale=1.0, seconds=0.0
     )
     assert np.isfinite(found["StokesDrag"].outcome).all()
-    assert found["StokesDrag"].verdict == BLURRED
+    assert found["StokesDrag"].verdict == UNRESOLVED

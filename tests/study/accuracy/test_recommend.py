@@ -11,8 +11,8 @@ import pytest
 from physjax import Particles, Scene, accuracy, contacts, forces, methods
 from physjax.scenes import SCENES
 from physjax.study.accuracy import error_measures, recommend
-from physjax.study.accuracy.method_facts import contender
-from physjax.study.accuracy.reference_solution import yardstick
+from physjax.study.accuracy.method_facts import compile_run
+from physjax.study.accuracy.reference_solution import solve_reference
 from physjax.study.problem import Problem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -57,11 +57,13 @@ def test_the_answer_prints_as_a_table_with_reason_and_evidence(swings):
 
 def test_a_state_too_large_for_diffrax_is_measured_by_our_own_fine_steps_as_right(monkeypatch):
     problem = Problem(spring(), 4.0, frames=8)
-    by_diffrax = yardstick(problem)
-    monkeypatch.setattr("physjax.study.accuracy.reference_solution.LARGE", 3)  # a ball in the plane has four numbers
-    own = yardstick(problem, wanted=1e-7)
+    by_diffrax = solve_reference(problem)
+    monkeypatch.setattr(
+        "physjax.study.accuracy.reference_solution.MAX_DIFFRAX_NUMBERS", 3
+    )  # a ball in the plane has four numbers
+    own = solve_reference(problem, wanted=1e-7)
     assert own.source.startswith("own rk4")
-    assert own.doubt().max() < 2e-9
+    assert own.truth_error().max() < 2e-9
     assert error_measures.path.error(own.scene, own.times, own.states, by_diffrax.states) < 2e-9
 
 
@@ -69,8 +71,8 @@ def test_a_state_too_large_for_diffrax_is_measured_by_our_own_fine_steps_as_righ
 def test_a_random_scene_keeps_its_promise_against_another_reference():
     """Diffrax in the search, our own rk4 with fine steps here."""
     scene, horizon = random_scene(2)
-    other = yardstick(Problem(scene, horizon), wanted=1e-7, own=methods.rk4)
-    assert other.doubt().max() < 1e-8
+    other = solve_reference(Problem(scene, horizon), wanted=1e-7, own=methods.rk4)
+    assert other.truth_error().max() < 1e-8
     for advice in recommend(scene, error=ERRORS, horizon=horizon, methods=FEW, progress=False):
         assert (
             error_measures.path.error(other.scene, other.times, advice.simulate().state, other.states) <= advice.error
@@ -134,7 +136,7 @@ def test_a_gradient_must_keep_the_error_as_well():
     with jax.enable_x64(True):
         problem = Problem(spring(), 10.0)
         push = Particles(jnp.zeros(2), jnp.asarray([1.0, 0.0]))
-        _, slopes = contender(problem, advice.best.method, push=push)(advice.best.steps_per_frame)
+        _, slopes = compile_run(problem, advice.best.method, push=push)(advice.best.steps_per_frame)
     true = np.sin(3 * problem.times) / 3
     assert np.abs(np.asarray(slopes.position[:, 0]) - true).max() <= 1e-5 * np.abs(true).max()
 
@@ -219,7 +221,7 @@ def test_lanes_of_every_size_are_each_resolved():
     scene = Scene(Particles(jnp.zeros((6, 2)), jnp.asarray(speed)), forces=(forces.StokesDrag(0.5),))
     advice = recommend(scene, error=1e-5, horizon=2.0, methods=FEW, dtypes=[np.float64], progress=False)
     assert advice.ok, advice.reason
-    assert advice.doubt < 1e-11
+    assert advice.truth_error < 1e-11
     exact = speed[:, 0] / 0.5 * (1 - np.exp(-0.5 * 2.0))
     np.testing.assert_allclose(advice.simulate().position[-1, :, 0], exact, rtol=2e-5)
 
@@ -228,8 +230,8 @@ def test_a_period_that_divides_the_moments_is_no_chaos():
     # at each moment it is where it began
     problem = Problem(spring((2 * np.pi / 0.5) ** 2), 32.0)
     with jax.enable_x64(True):
-        truth = yardstick(problem)
-    assert truth.doubt().max() < 1e-11
+        truth = solve_reference(problem)
+    assert truth.truth_error().max() < 1e-11
     assert truth.horizon(1e-6, 1e-15) == np.inf
     assert truth.reach.max() == pytest.approx(2.0, rel=0.02)
 
@@ -249,7 +251,7 @@ def test_dry_friction_is_walked_through_and_never_called_chaos():
 @pytest.mark.slow
 def test_what_is_as_far_off_from_a_smaller_nudge_has_not_grown():
     with jax.enable_x64(True):
-        truth = yardstick(Problem(spring(), 4.0, frames=8))
+        truth = solve_reference(Problem(spring(), 4.0, frames=8))
     noise = jax.tree.map(lambda leaf: leaf * (1 + np.linspace(0.0, 1.0, 9)[:, None] ** 9), truth.states)
     jumpy = truth._replace(nudged=noise, less_nudged=lambda: noise)
     assert jumpy.growth().max() > 1e8

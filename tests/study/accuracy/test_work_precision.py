@@ -12,11 +12,11 @@ from physjax import Particles, Scene, contacts, forces, lattices, methods, sprin
 from physjax.scene import as_module
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import sample_states
 from physjax.study import accuracy
 from physjax.study.accuracy import Budget, work_precision
-from physjax.study.accuracy.method_facts import copies
-from physjax.text import seconds_text
+from physjax.study.accuracy.method_facts import stack_copies
+from physjax.text import format_seconds
 
 FEW = Budget(seconds=0.02, repeats=1, refinement=2.0)
 
@@ -48,7 +48,7 @@ def test_runs_that_fail_are_kept_with_their_step():
     assert {run.status for run in rk4 if run.dt > 1.02 * limit} <= {"not finite", "off the path"}
     assert all(run.status == "ok" for run in rk4 if run.dt < 0.9 * limit)
     assert rk4[0].status != "ok"
-    assert seconds_text(min(run.dt for run in rk4 if run.status != "ok")) in stiff.table()
+    assert format_seconds(min(run.dt for run in rk4 if run.status != "ok")) in stiff.table()
 
 
 def test_steps_fit_between_the_moments_compared(swing):
@@ -278,8 +278,8 @@ def test_times_are_those_of_the_batch_and_errors_those_of_one(both_kinds):
 @pytest.mark.parametrize("name", ["oscillator", "kepler", "hanging_rope"])
 def test_copies_of_a_scene_move_as_it_does(name):
     problem = SCENES[name]()
-    run = lambda scene: sample(scene, as_module(methods.euler), problem.duration / 640, jnp.asarray(2), frames=4)  # noqa: E731
-    one, many = run(problem.scene), run(copies(problem.scene, 3))
+    run = lambda scene: sample_states(scene, as_module(methods.euler), problem.duration / 640, jnp.asarray(2), frames=4)  # noqa: E731
+    one, many = run(problem.scene), run(stack_copies(problem.scene, 3))
     assert many.position.shape[1] == 3
     np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
 
@@ -322,8 +322,8 @@ def breaking_rope():
     ],
 )
 def test_copies_remember_each_on_its_own(build):
-    run = lambda scene: sample(scene, as_module(methods.verlet), 0.02, jnp.asarray(10), frames=4)  # noqa: E731
-    one, many = run(build()), run(copies(build(), 3))
+    run = lambda scene: sample_states(scene, as_module(methods.verlet), 0.02, jnp.asarray(10), frames=4)  # noqa: E731
+    one, many = run(build()), run(stack_copies(build(), 3))
     assert many.position.shape[1] == 3
     np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
 

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from physjax import Particles, Scene, aim_at, contacts, forces, methods, projectile, reference, simulate
 from physjax.scene import as_module
-from physjax.study.inverse.shooting import Launch, Range, nearest
+from physjax.study.inverse.shooting import AimProblem, Launch, find_nearest_launch
 from physjax.vectors import norm
 
 RNG = np.random.default_rng(7)
@@ -136,7 +136,7 @@ def windy():
     scene = ball(2, forces.QuadraticDrag(**BASEBALL, wind=wind), position=np.zeros((COUNT, 2)))
     thrown = Particles(scene.state.position, jnp.asarray(speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)))
     time = jnp.asarray(RNG.uniform(0.2, 1.1, COUNT) * 2 * speed / 9.8)
-    target = simulate(scene.having(state=thrown), methods.rk4, dt=time / 400, steps=400, save_every=400).position[-1]
+    target = simulate(scene.replace(state=thrown), methods.rk4, dt=time / 400, steps=400, save_every=400).position[-1]
     return scene, target, jnp.asarray(speed), angle, aim_at(scene, target, speed=jnp.asarray(speed))
 
 
@@ -171,7 +171,9 @@ def test_reach_with_drag_is_that_of_brute_force():
     angle = jnp.linspace(0.2, 1.2, 4001)
     fan = 30.0 * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     scene = ball(2, drag, position=jnp.zeros((4001, 2)))
-    paths = simulate(scene.having(state=Particles(jnp.zeros((4001, 2)), fan)), methods.rk4, dt=0.01, steps=700).position
+    paths = simulate(
+        scene.replace(state=Particles(jnp.zeros((4001, 2)), fan)), methods.rk4, dt=0.01, steps=700
+    ).position
     x, y = np.asarray(paths[..., 0]), np.asarray(paths[..., 1])
     down = np.argmax((y[1:] < 0) & (y[:-1] >= 0), axis=0)[None]
     at = lambda a, i: np.take_along_axis(a, i, axis=0)[0]  # noqa: E731
@@ -315,12 +317,12 @@ def test_what_is_no_scene_or_no_method_is_told(unannotated):
 def test_the_descent_to_a_hit_ends_at_rounding(precision):
     """Damped steps leave a share of the miss: it has to go on until nothing but rounding is left."""
     targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(64, RNG.uniform(0.1, 0.9, 64)))
-    shots = Range(ball(position=jnp.zeros((64, 2), precision.dtype)), targets, as_module(methods.rk4), 32)
+    shots = AimProblem(ball(position=jnp.zeros((64, 2), precision.dtype)), targets, as_module(methods.rk4), 32)
     truth = projectile.angles_for_target(targets[:, 0], targets[:, 1], speed)
     time = targets[:, 0] / (speed * jnp.cos(truth.low))
     angle = truth.low + jnp.linspace(-0.05, 0.05, 64, dtype=precision.dtype)
     start = Launch(speed[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1), time)
-    found, distance = jax.jit(nearest)(shots, start, speed, jnp.ones(64, bool))
+    found, distance = jax.jit(find_nearest_launch)(shots, start, speed, jnp.ones(64, bool))
     extent = norm(targets) + speed * found.time
     assert (distance / extent).max() < 8 * precision.eps
     assert (distance <= shots.rounding(found)).all()

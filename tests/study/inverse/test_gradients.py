@@ -57,7 +57,7 @@ def test_a_ball_that_bounces_on_top_of_a_sphere_is_lost_exponentially():
     later = np.log(limit / told.sensitivity[-1]) / np.log(root)
     assert told.horizon == pytest.approx((bounces + later) * flight, rel=1e-6)
     # the bounces themselves go astray where it says
-    shifted = ball.having(state=ball.state._replace(position=ball.state.position + jnp.asarray([1e-7, 0.0])))
+    shifted = ball.replace(state=ball.state._replace(position=ball.state.position + jnp.asarray([1e-7, 0.0])))
     run = simulate(shifted, methods.leapfrog, dt=flight / 20, steps=20 * bounces, save_every=20)
     error = gradients.health(
         ball, methods.leapfrog, dt=flight / 20, steps=20 * bounces, save_every=20, size=radius, error=1e-7
@@ -83,7 +83,7 @@ def test_three_bodies_are_chaotic_as_finite_differences_say():
     assert told.horizon > told.time[-1]
 
     def path(x):
-        return simulate(scene.having(state=Particles(x, scene.state.velocity)), methods.rk4, **OPTIONS).position
+        return simulate(scene.replace(state=Particles(x, scene.state.velocity)), methods.rk4, **OPTIONS).position
 
     steps = 1e-7 * jnp.eye(6).reshape(6, 3, 2)
     x = scene.state.position
@@ -98,7 +98,7 @@ def test_beyond_the_horizon_paths_from_rounded_starts_have_nothing_in_common():
     told = gradients.health(scene, methods.rk4, **OPTIONS, error=error)
     assert 20.0 < told.horizon < 40.0
     way = jax.random.normal(jax.random.key(0), (3, 2))
-    shifted = scene.having(state=scene.state._replace(position=scene.state.position + error * way))
+    shifted = scene.replace(state=scene.state._replace(position=scene.state.position + error * way))
     paths = [simulate(s, methods.rk4, **OPTIONS) for s in (scene, shifted)]
     apart = np.linalg.norm(paths[1].position - paths[0].position, axis=-1).max(axis=-1)
     size = float(told.limit) * error / 0.1
@@ -133,7 +133,7 @@ def test_many_directions_are_sampled():
     cloud = Scene(Particles(x, 0.1 * x), 0.05, (forces.Gravitation(G=1.0, softening=0.5),))
     told = gradients.health(cloud, methods.verlet, dt=0.02, steps=50, save_every=10)
     path = lambda x: simulate(  # noqa: E731
-        cloud.having(state=Particles(x, cloud.state.velocity)), methods.verlet, dt=0.02, steps=50, save_every=50
+        cloud.replace(state=Particles(x, cloud.state.velocity)), methods.verlet, dt=0.02, steps=50, save_every=50
     ).position[-1]
     whole = np.linalg.norm(jax.jacfwd(path)(cloud.state.position).reshape(40, 40)) / np.sqrt(40)
     assert told.sensitivity[-1] == pytest.approx(whole, rel=0.1)

@@ -9,7 +9,7 @@ from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
 
 ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-BOUNDED = {name: method for name, method in METHODS.items() if np.isfinite(method.promises.stable_to)}
+BOUNDED = {name: method for name, method in METHODS.items() if np.isfinite(method.promises.stability_limit)}
 SLOW_TO_GROW = {"euler", "midpoint"}
 
 
@@ -64,7 +64,7 @@ def test_the_lectures_oscillator_has_its_known_limits(method):
 @ALL
 @pytest.mark.parametrize("b", [None, 3.0, 20.0], ids=["undamped", "damped", "overdamped"])
 def test_the_limit_of_an_oscillator_is_the_measured_one(method, b):
-    if b is None and not method.promises.stable_to:
+    if b is None and not method.promises.stability_limit:
         pytest.skip("never stable: see the test of its growth")
     predicted = stability.limit(oscillator(b=b), method)
     assert stability.measure_limit(oscillator(b=b), method) == pytest.approx(predicted.dt, rel=0.02)
@@ -76,7 +76,7 @@ def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
     chain = SCENES["oscillator_chain"]().scene
     predicted = stability.limit(chain, method)
     omega = 2 * np.sqrt(400.0) * np.sin(50 * np.pi / 102)
-    assert predicted.dt == pytest.approx(method.promises.stable_to / omega, rel=1e-6)
+    assert predicted.dt == pytest.approx(method.promises.stability_limit / omega, rel=1e-6)
     if 0 < predicted.dt < np.inf:
         assert confirmed(chain, method, 2000)[1:] == (True, True)
         assert predicted.spring in [(i, i + 1) for i in range(20, 32)]
@@ -90,7 +90,7 @@ def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
     for name, method in BOUNDED.items():
         if count == 8 and name not in {"euler" if damped else "verlet", "semi_implicit_euler"}:
             continue
-        if not damped and not method.promises.stable_to:
+        if not damped and not method.promises.stability_limit:
             assert not stability.limit(scene, method).each.any()
             continue
         steps = 4000 if name not in SLOW_TO_GROW else 8000 if count == 8 else 20_000
@@ -144,7 +144,7 @@ def test_the_region_reaches_as_far_as_promised(method):
     region = stability.region(method, real=(-0.5, 0.5), imaginary=(-4.0, 4.0), points=(3, 801))
     axis = region.radius[:, 1]
     stable = np.abs(region.z.imag[:, 1][axis <= 1 + 1e-9]).max()
-    assert stable == pytest.approx(min(method.promises.stable_to, 4.0), abs=0.0101)
+    assert stable == pytest.approx(min(method.promises.stability_limit, 4.0), abs=0.0101)
 
 
 def test_the_region_of_rk4_is_that_of_its_polynomial():
@@ -219,7 +219,7 @@ def test_what_grows_by_itself_sets_no_limit_and_does_not_hide_what_does(method, 
     lanes = Particles(jnp.zeros((2, 2)), jnp.zeros((2, 2)))
     scene = Scene(lanes, forces=(hill, push, *drag))
     assert stability.grows_by_itself(scene).all()
-    promised = method.promises.stable_to / 10.0
+    promised = method.promises.stability_limit / 10.0
     assert stability.limit(scene, method).dt == pytest.approx(promised, rel=0.05 if b else 1e-6)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from physjax import sweep
-from physjax.study.sweeps.batching import traced
+from physjax.study.sweeps.batching import trace_measure
 
 AXES = {"x": np.linspace(0.0, 1.0, 5)}
 NUMBER = jax.ShapeDtypeStruct((), jnp.float64)
@@ -27,7 +27,7 @@ def quiet(measure, **options):
 
 def known(measure):
     """What a folder would know a measure by."""
-    return traced(measure, {"x": NUMBER}).lasting_digest
+    return trace_measure(measure, {"x": NUMBER}).persistent_digest
 
 
 def gained(x):

@@ -197,9 +197,12 @@ def test_axes_that_are_not_those_of_the_folder_are_refused(tmp_path):
 def test_a_folder_in_use_is_refused_unless_both_share(tmp_path):
     quiet(product, AXES, batch=100, out=tmp_path, shard=(0, 2))
     manifest = store.found(tmp_path).manifest
-    with store.opened(tmp_path, manifest, (0, 1), {}), pytest.raises(ValueError, match="another process is at work"):
+    with (
+        store.open_folder(tmp_path, manifest, (0, 1), {}),
+        pytest.raises(ValueError, match="another process is at work"),
+    ):
         quiet(product, AXES, out=tmp_path, shard=(1, 2))
-    with store.opened(tmp_path, manifest, (0, 2), {}):
+    with store.open_folder(tmp_path, manifest, (0, 2), {}):
         for shard in (None, (0, 2)):
             with pytest.raises(ValueError, match=r"another process is at work.*shard="):
                 quiet(product, AXES, out=tmp_path, shard=shard)

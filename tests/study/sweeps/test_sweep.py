@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, contacts, forces, lattices, methods, simulate, solve, state_after, sweep
-from physjax.stepping.simulate import sample
+from physjax.stepping.simulate import sample_states
 from physjax.study.sweeps import batching
 
 SPEED, ANGLE = np.linspace(5.0, 40.0, 7), np.linspace(0.2, 1.3, 5)
@@ -108,9 +108,9 @@ def test_memory_decides_the_size_of_batches_and_bounds_what_xla_takes():
         return simulate(ball(speed, angle), methods.rk4, dt=0.02, steps=200).position
 
     point = {name: jax.ShapeDtypeStruct((), np.float64) for name in ("speed", "angle")}
-    program = batching.traced(film, point)
+    program = batching.trace_measure(film, point)
     for memory in (1 << 20, 1 << 24):
-        cut = batching.layout(program, 10**6, memory, jax.local_devices()[:1])
+        cut = batching.choose_layout(program, 10**6, memory, jax.local_devices()[:1])
         one = jax.vmap(jax.extend.core.jaxpr_as_fun(program.jaxpr))
         shape = jax.ShapeDtypeStruct((cut.count, cut.size), np.float64)
         needs = (
@@ -208,10 +208,10 @@ def test_dt_at_a_fixed_duration_sweeps_by_step_counts_of_each_lane():
         end = state_after(scene, methods.rk4, duration=2.0, dt=dt)
         return end, jnp.abs(end.state.position[0] - math.cos(4.0))
 
-    before = sample._cache_size()
+    before = sample_states._cache_size()
     dts = 2.0 / np.array([20, 40, 80, 160, 320])
     end, error = quiet(wind_up, {"dt": dts}).values
-    assert sample._cache_size() <= before + 1
+    assert sample_states._cache_size() <= before + 1
     np.testing.assert_array_equal(end.steps, [20, 40, 80, 160, 320])
     np.testing.assert_allclose(end.dt, dts)
     orders = np.log2(error[:-1] / error[1:])

@@ -1,0 +1,82 @@
+"""`physjax aim`: which launch hits a target."""
+
+import argparse
+from typing import Any
+
+
+def add_command(commands: Any) -> None:
+    """Enter the command and its options among those of `physjax`."""
+    command = commands.add_parser("aim", help="which angle hits a target: both arcs, with drag and wind")
+    command.add_argument("--target", type=float, nargs="+", required=True, metavar="M", help="x y, or x y z [m]")
+    command.add_argument("--speed", type=float, help="launch speed [m/s]; the least that hits if left out")
+    command.add_argument(
+        "--start", type=float, nargs="+", metavar="M", help="where it is fired from [m] (default: the origin)"
+    )
+    command.add_argument(
+        "--drag", type=float, metavar="CDA", help="drag coefficient times area [m²], in air of 1.225 kg/m³"
+    )
+    command.add_argument("--mass", type=float, default=1.0, help="mass [kg] (default: 1)")
+    command.add_argument(
+        "--wind", type=float, nargs="+", metavar="V", help="velocity of the air [m/s]; acts through --drag"
+    )
+    command.add_argument("--gravity", type=float, default=9.8, help="g [m/s²] (default: 9.8)")
+    command.add_argument("--up", choices="xyz", default="y", help="the axis that is up (default: y)")
+    command.add_argument("--out", default="aim", metavar="DIR", help="where the picture goes (default: aim)")
+    command.set_defaults(run=_run_aim)
+
+
+def _run_aim(options: argparse.Namespace) -> None:
+    """Print both arcs to a target with their angle, flight time and apex; write their picture as PNG."""
+    import jax
+    import matplotlib
+    import numpy as np
+
+    from physjax.files import ensure_writable_folder, write_atomically
+    from physjax.study.inverse.aim import aim_at
+    from physjax.text import format_table
+
+    with jax.enable_x64(True):
+        scene = _build_throw(options)
+        folder = ensure_writable_folder(options.out)
+        aimed = aim_at(scene, options.target, speed=options.speed)
+        arcs = {"low": aimed.low, "high": aimed.high} if options.speed is not None else {"least speed": aimed.low}
+        angles = ["angle [°]"] if aimed.low.azimuth is None else ["angle [°]", "azimuth [°]"]
+        rows = [
+            [
+                name,
+                "hit" if shot.ok else "out of reach",
+                *(f"{np.degrees(angle):.4f}" for angle in (shot.angle, shot.azimuth) if angle is not None),
+                *(f"{float(number):.4f}" for number in (shot.speed, shot.time, shot.apex)),
+                f"{float(shot.miss):.2g}",
+            ]
+            for name, shot in arcs.items()
+        ]
+        headers = ["arc", "", *angles, "speed [m/s]", "time [s]", "apex [m]", "miss [m]"]
+        print(format_table(headers, rows, align="<<" + ">" * (len(headers) - 2)))
+        if not aimed.ok:
+            print("The target is out of reach: these are the nearest misses.")
+        matplotlib.use("Agg")
+        with write_atomically(folder / "aim.png", "wb") as file:
+            aimed.plot().figure.savefig(file, dpi=125)
+    print(f"Picture: {folder / 'aim.png'}")
+
+
+def _build_throw(options: argparse.Namespace):
+    """The scene of `physjax aim`."""
+    from physjax.particles import Particles
+    from physjax.physics import forces
+    from physjax.scene import Scene
+
+    dim = len(options.target)
+    start = options.start or [0.0] * dim
+    for name, given in (("start", start), ("wind", options.wind)):
+        if given is not None and len(given) != dim:
+            raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
+    if options.wind is not None and options.drag is None:
+        raise ValueError("--wind: got a wind without --drag, expected both: the air acts through the drag.")
+    if options.up == "z" and dim == 2:
+        raise ValueError("--up: got z with a target in the plane, expected x or y, or a third number for --target.")
+    loads = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
+    if options.drag is not None:
+        loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
+    return Scene(Particles(start, [0.0] * dim), mass=options.mass, forces=tuple(loads))

@@ -1,0 +1,134 @@
+"""`physjax chart`: speed against accuracy for scenes of the gallery, as pictures, CSV and one page."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+BOUNCING_SCENE = "bouncing_ball"
+"""The scene that shows what a contact does to the order of a method."""
+
+
+def add_command(commands: Any) -> None:
+    """Enter the command and its options among those of `physjax`."""
+    command = commands.add_parser("chart", help="chart speed against accuracy for the scenes of the gallery")
+    command.add_argument(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help="names from `physjax scenes`; by default all smooth ones and a ball that bounces",
+    )
+    command.add_argument(
+        "--out", default="chart", metavar="DIR", help="where pictures, CSV and the page go (default: chart)"
+    )
+    command.add_argument("--quick", action="store_true", help="coarser and faster")
+    command.add_argument(
+        "--report", action="store_true", help="a page for each scene instead: all there is to say of it, charts coarse"
+    )
+    command.set_defaults(run=lambda options: _run_chart(options.scenes, options.out, options.quick, options.report))
+
+
+def _run_chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
+    """Study the scenes one by one; write PNG, CSV and one HTML page, print one table; or a page on the whole of each."""
+    import matplotlib
+
+    from physjax.checks import demand_known
+    from physjax.files import ensure_writable_folder, write_atomically
+    from physjax.scenes import SCENES
+    from physjax.study import report_page
+
+    names = [demand_known("scene", name, SCENES) for name in dict.fromkeys(names)] or _select_smooth_scenes()
+    folder = ensure_writable_folder(out)
+    matplotlib.use("Agg")
+    if whole:
+        return _write_reports(names, folder)
+    results = [_study_scene(name, folder, quick) for name in names]
+    summary = _summarise([result for result, _ in results])
+    with write_atomically(folder / "index.html") as file:
+        file.write(
+            report_page.build_page("physjax: speed against accuracy", summary, [section for _, section in results])
+        )
+    print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
+    print(f"Measured on {report_page.describe_machine()}.\nCharts: {folder / 'index.html'}")
+
+
+def _select_smooth_scenes() -> list[str]:
+    """What is charted unless told otherwise: motions without contacts or memory, and `BOUNCING_SCENE` for what a contact does.
+
+    The others are charted when they are named; all of them together would take an hour.
+    """
+    from physjax.scenes import SCENES
+
+    return [name for name, build in SCENES.items() if name == BOUNCING_SCENE or build().is_ode]
+
+
+def _write_reports(names: list[str], folder: Path) -> None:
+    """Write a page on each scene, with its parts as progress."""
+    import jax
+
+    from physjax.files import write_atomically
+    from physjax.scenes import SCENES, title
+    from physjax.study.report_page import build_page
+    from physjax.study.scene_report import PARTS, build_sections
+
+    for name in names:
+        with jax.enable_x64(True):
+            problem = SCENES[name]()
+        with tqdm(total=len(PARTS), desc=f"{name:<16}", unit="part", file=sys.stderr) as bar:
+            reported = []
+            for section in build_sections(problem, name, title(name), progress=bar.set_postfix_str):
+                reported.append(section)
+                bar.update()
+        with write_atomically(folder / f"{name}.html") as file:
+            file.write(build_page(name.replace("_", " "), "", reported))
+        print(f"Report: {folder / f'{name}.html'}", flush=True)
+
+
+def _study_scene(name: str, folder: Path, quick: bool):
+    """One scene: its work-precision study, with PNG and CSV written; the result and its section of the page."""
+    import jax
+
+    from physjax.files import write_atomically
+    from physjax.scenes import SCENES, title
+    from physjax.stepping.methods import METHODS
+    from physjax.study import accuracy
+    from physjax.study.report_page import Section, Table, encode_figure
+
+    with jax.enable_x64(True):
+        problem = SCENES[name]()
+    rivals = accuracy.default_rivals() if problem.is_ode else ()
+    with tqdm(total=1 + len(METHODS) + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
+
+        def progress(what: str) -> None:
+            bar.set_postfix_str(what)
+            bar.update()
+
+        budget = accuracy.QUICK if quick else accuracy.THOROUGH
+        result = accuracy.work_precision(problem, rivals=rivals, budget=budget, name=name, progress=progress)
+        bar.set_postfix_str("done")
+    picture = encode_figure(result.plot(), f"charts of {name}")
+    with write_atomically(folder / f"{name}.png", "wb") as file:
+        file.write(picture.data)
+    result.to_csv(folder / f"{name}.csv")
+    return result, Section(name, title(name), picture, Table(result.table()))
+
+
+def _summarise(results: list) -> str:
+    """A line for each scene: the fastest method, its step and time, for each of the errors."""
+    from physjax.study.accuracy.result import TABLE_ERRORS
+    from physjax.text import format_table
+
+    headers = ["scene", *(f"error {error:.0e}" for error in TABLE_ERRORS), "truth"]
+    rows = [[r.name, *(_format_fastest(r, error) for error in TABLE_ERRORS), r.truth] for r in results]
+    return format_table(headers, rows, align="<" * len(headers))
+
+
+def _format_fastest(result, error: float) -> str:
+    from physjax.text import format_seconds
+
+    run = result.fastest(error)
+    if run is None:
+        return "none within the budget"
+    how = f"dt {format_seconds(run.dt)}" if run.dt is not None else f"tol {run.tolerance:.0e}"
+    return f"{run.method}, {how}: {format_seconds(run.seconds)}"
