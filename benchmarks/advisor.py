@@ -36,11 +36,13 @@ from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
 from physjax.stepping.reference import cast_floats, discontinuities, ode_term
 from physjax.study.accuracy import error_measures, recommend
-from physjax.study.accuracy.method_facts import compile_run, smallest_size, stack_copies
+from physjax.study.accuracy.compiled_run import compile_run, stack_copies
+from physjax.study.accuracy.method_facts import smallest_size
 from physjax.study.accuracy.recommend import list_candidates
 from physjax.study.accuracy.reference_solution import solve_reference
-from physjax.study.accuracy.search import SearchTask, explore_method, time_in_turn
+from physjax.study.accuracy.search import SearchTask, explore_method, time_finalists
 from physjax.study.problem import Problem
+from physjax.timing import time_repeatedly
 
 ERRORS = (1e-2, 1e-4, 1e-6)
 RANDOM_SCENES = 40
@@ -117,7 +119,7 @@ def judge_promise(problem, other, truth_error, advice, runs):
         # the few that look fastest take turns: a single look may have met a quiet moment
         few = sorted(good, key=lambda pair: pair[1].seconds)[:3]
         turns = [(mine, good[0][1]._replace(fineness=fineness)), *few]
-        own, *others = time_in_turn([(entry, trial._replace(seconds=np.inf)) for entry, trial in turns])
+        own, *others = time_finalists([(entry, trial._replace(seconds=np.inf)) for entry, trial in turns])
         fastest = int(np.argmin(others))
         row |= {"ratio": own / others[fastest], "fastest": few[fastest][0].name}
         row["its_step"] = few[fastest][0].dt(few[fastest][1].fineness)
@@ -197,11 +199,9 @@ def time_rival(single, many, truth, solver):
     for tol in 10.0 ** -np.arange(2, 12):
         size = smallest_size(single)
         run = partial(solve_copies, single, many.scene.state, many.duration, tol, size, solver, many.frames)
-        states = jax.tree.map(np.asarray, run())
+        states, timing = time_repeatedly(run, 3, longest=SLOW_RUN_SECONDS)
+        states, seconds = jax.tree.map(np.asarray, states), timing.least
         error = error_measures.path.error(truth.scene, truth.times, states, truth.states)
-        seconds = harness.time_call(run)
-        if seconds < SLOW_RUN_SECONDS:
-            seconds = min(seconds, *(harness.time_call(run) for _ in range(2)))
         if not np.isfinite(error):
             continue  # too loose to hold, and out of steps: a tighter one may hold, and be faster
         runs.append({"solver": solver, "tolerance": tol, "error": error, "seconds": seconds})

@@ -1,9 +1,7 @@
 """What every benchmark shares: the machine, timing side by side, counting compilations, tables, charts, whole files.
 
-Contenders take turns in one process, one round after the other, so that whatever else the machine does meets all of
-them. A turn lasts half a second for everyone, so that no short call slips through a gap that a long one cannot, and
-begins with a call that does not count: it pays for what the one before left behind (memory to return, cold caches).
-The very first call, which compiles, is kept apart. Times are those of finished work.
+Contenders take turns of half a second in one process, by the policy of `physjax.timing`; the very first call, which
+compiles, is timed by itself. Times are those of finished work.
 """
 
 import argparse
@@ -14,10 +12,10 @@ import math
 import os
 import platform
 import re
-import statistics
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,6 +30,8 @@ import jax
 
 import physjax
 from physjax.files import ensure_writable_folder, write_atomically
+from physjax.text import format_table
+from physjax.timing import Timing, time_in_turn
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -46,30 +46,6 @@ _compile_seconds: list[float] = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda event, seconds, **_: _compile_seconds.append(seconds) if event.endswith("backend_compile_duration") else None
 )
-
-
-class Timing(NamedTuple):
-    """Seconds of the first call, of XLA's compiler within it, of a call in every turn, and processor seconds of those."""
-
-    first: float
-    compiling: float
-    seconds: tuple[float, ...]
-    busy: tuple[float, ...]
-
-    @property
-    def least(self) -> float:
-        """A call in the least disturbed turn [s]."""
-        return min(self.seconds)
-
-    @property
-    def median(self) -> float:
-        """A call in an ordinary turn [s]."""
-        return statistics.median(self.seconds)
-
-    @property
-    def cores(self) -> float:
-        """Cores in use on average: well below 1 for work on the CPU means that something else had the machine."""
-        return sum(self.busy) / sum(self.seconds)
 
 
 class Bar(NamedTuple):
@@ -143,34 +119,14 @@ def time_side_by_side(
         firsts[name] = time.perf_counter() - start, sum(compiling)
         check(name, found)
         print_progress(f"  {name}: first call {firsts[name][0]:.2f} s")
-    taken = {name: [] for name in firsts}
-    for _ in range(repeats):
-        for name, times in taken.items():
-            times.append(time_turn(contenders[name]))
-    return {name: Timing(*firsts[name], *zip(*times, strict=True)) for name, times in taken.items()}, failed
-
-
-def time_turn(run: Callable[[], Any]) -> tuple[float, float]:
-    """Mean seconds and processor seconds of a call, over calls that fill a turn after one that does not count.
-
-    A call that fills the turn by itself is not repeated.
-    """
-    calls, busy = 0, time.process_time()
-    warming = time_call(run)
-    if warming >= TURN_SECONDS:
-        return warming, time.process_time() - busy
-    start, busy = time.perf_counter(), time.process_time()
-    while calls == 0 or time.perf_counter() - start < TURN_SECONDS:
-        jax.block_until_ready(run())
-        calls += 1
-    return (time.perf_counter() - start) / calls, (time.process_time() - busy) / calls
-
-
-def time_call(run: Callable[[], Any]) -> float:
-    """Seconds until the result of a call is there [s]."""
-    start = time.perf_counter()
-    jax.block_until_ready(run())
-    return time.perf_counter() - start
+    turns = time_in_turn(
+        [contenders[name] for name in firsts],
+        slice_seconds=TURN_SECONDS,
+        seconds=0.0,
+        rounds=(repeats, repeats),
+    )
+    timings = zip(firsts, turns, strict=True)
+    return {name: timing._replace(first=firsts[name][0], compiling=firsts[name][1]) for name, timing in timings}, failed
 
 
 def time_imports(modules: Sequence[str], repeats: int) -> dict[str, float]:
@@ -263,16 +219,8 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """A table whose first column is text and whose others are numbers."""
-    cells = [list(head), *([cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    print(f"\n{title}")
-    for n, row in enumerate(cells):
-        print(
-            "  "
-            + "  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
-        )
-        if n == 0:
-            print("  " + "  ".join("-" * width for width in widths))
+    cells = [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in rows]
+    print(f"\n{title}\n{textwrap.indent(format_table(head, cells), '  ')}")
 
 
 def make_row(name: str, family: str, work: float, timing: Timing) -> dict[str, Any]:

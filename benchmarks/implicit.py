@@ -13,7 +13,6 @@ All run on one core if the process may use one (taskset -c 0).
 
 import math
 import statistics
-import time
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,6 +27,7 @@ from physjax.files import write_atomically
 from physjax.stepping.implicit import ImplicitEuler
 from physjax.stepping.krylov import conjugate_gradients
 from physjax.stepping.reference import cast_floats
+from physjax.timing import time_call, time_repeatedly
 
 DT, RESIDUAL_TOLERANCE = 1 / 60, 1e-3
 GAME_METHOD = ImplicitEuler(tolerance=RESIDUAL_TOLERANCE)
@@ -64,9 +64,9 @@ def time_frames(scene: Scene, frames: int) -> tuple[list[float], list[int], list
     jax.block_until_ready(step(scene).state)
     seconds, products, residuals, middle = [], [], [], scene
     for i in range(frames):
-        start = time.perf_counter()
-        after = jax.block_until_ready(step(scene, first_step=i).final_scene)
-        seconds.append(time.perf_counter() - start)
+        flight, taken = time_call(partial(step, scene, first_step=i))
+        after = flight.final_scene
+        seconds.append(taken)
         report = GAME_METHOD.report(scene, DT)
         products.append(int(report.products))
         residuals.append(float(report.residual))
@@ -230,8 +230,9 @@ def measure_work_and_error(scene: Scene, size: Settings, omega: float) -> list[d
         method = GAME_METHOD if name == "implicit_euler" else getattr(methods, name)
         for n in [fewest * 2**i for i in range(size.refinements if name == "implicit_euler" else 3)]:
             run = partial(simulate_final, scene, method, n * size.horizon, size)
-            error = float(np.sqrt(np.mean((np.asarray(run(), float) - exact) ** 2)))
-            ms = 1e3 * min(harness.time_call(run) for _ in range(size.repeats)) / size.horizon
+            found, timing = time_repeatedly(run, size.repeats, longest=math.inf)
+            error = float(np.sqrt(np.mean((np.asarray(found, float) - exact) ** 2)))
+            ms = 1e3 * timing.least / size.horizon
             rows.append({"method": name, "steps_a_frame": n, "error": error, "ms": ms})
             print_progress(f"  {name}, {n} steps a frame: {ms:.2f} ms a frame, error {error:.2e} m")
     return rows

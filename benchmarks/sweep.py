@@ -29,6 +29,7 @@ from harness import Bar, print_progress
 from scipy.integrate import solve_ivp
 
 from physjax import Particles, Scene, forces, methods, ode_term, reference, simulate, sweep
+from physjax.timing import time_call
 
 STEPS, DT = 400, 0.01
 AREA, DRAG, DENSITY, MASS, G = 4.3e-3, 0.35, 1.225, 0.145, 9.8
@@ -152,7 +153,7 @@ def time_devices(points: int, repeats: int) -> tuple[float, ...]:
         for count, times in taken.items():
             for thread in os.listdir("/proc/self/task"):
                 os.sched_setaffinity(int(thread), cores[:count])
-            times.append(harness.time_call(partial(run_sweep, points, devices=jax.local_devices()[:count])))
+            times.append(time_call(partial(run_sweep, points, devices=jax.local_devices()[:count]))[1])
     return tuple(min(times[1:]) for times in taken.values())
 
 

@@ -43,6 +43,7 @@ from rivals import (
 
 from physjax import Particles, Scene, forces, methods, simulate
 from physjax.stepping.methods import METHODS
+from physjax.timing import time_call
 
 
 class Settings(NamedTuple):
@@ -163,7 +164,7 @@ def time_compilation() -> list[dict]:
                 return lambda: simulate(scene, method, dt=dt, steps=100, save_every=10).position
 
             with harness.record_compilations() as seen:
-                first.append(harness.time_call(lambda run=run: run()()))
+                first.append(time_call(lambda run=run: run()())[1])
             xla.append(sum(seen))
             with harness.record_compilations() as seen:
                 for changed in ({"dt": 0.5 * DT}, {"speed": 2.0}, {"mass": 3.0}, {"wind": -4.0}):

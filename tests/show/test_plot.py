@@ -69,7 +69,7 @@ def test_methods_keep_apart_in_colour_and_marker():
 
 def test_both_treatments_of_a_bounce_are_told_apart_and_belong_together():
     for name in METHODS:
-        timed, projected = plot.style(name), plot.style(name + style.PROJECTED_SUFFIX)
+        timed, projected = plot.style(name), plot.style(name, treatment=style.PROJECTED)
         assert (projected["color"], projected["marker"]) == (timed["color"], timed["marker"])
         assert (timed["linestyle"], projected["linestyle"]) == ("-", "--")
         assert projected["markerfacecolor"] == "white"

@@ -1,7 +1,6 @@
 """What each part of a model is worth: leave it out, see what that does to the outcome, and what it saves."""
 
 import math
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from physjax.stepping.simulate import simulate
 from physjax.study.ablation.variants import Variant, list_pair_variants, list_variants
 from physjax.study.stability.limits import check_method
 from physjax.text import format_seconds, format_table
+from physjax.timing import time_in_turn
 
 NEEDED, NEGLIGIBLE, COSTLY, NONE = "needed", "negligible", "costs more than it gives", "none"
 UNRESOLVED = "shorter dt"
@@ -234,21 +234,8 @@ def _time_runs(runs: list[Callable], seconds: float) -> list[tuple[float, float]
     """The least time of each run [s] and its spread, from the least to the lower quartile; all take turns."""
     if seconds == 0:
         return [(math.nan, math.nan)] * len(runs)
-    counts = []
-    for run in runs:
-        run()
-        counts.append(max(1, math.ceil(SAMPLE_SECONDS / _time_run(run))))
-    taken, begun = [[] for _ in runs], time.perf_counter()
-    while len(taken[0]) < MIN_SAMPLES or (len(taken[0]) < MAX_SAMPLES and time.perf_counter() - begun < seconds):
-        for run, count, times in zip(runs, counts, taken, strict=True):
-            times.append(min(_time_run(run) for _ in range(count)))
-    return [(min(times), float(np.quantile(times, 0.25)) - min(times)) for times in taken]
-
-
-def _time_run(run: Callable) -> float:
-    started = time.perf_counter()
-    run()
-    return time.perf_counter() - started
+    timings = time_in_turn(runs, slice_seconds=SAMPLE_SECONDS, seconds=seconds, rounds=(MIN_SAMPLES, MAX_SAMPLES))
+    return [(timing.least, timing.spread) for timing in timings]
 
 
 def _count_step_cost(scene: Scene, method: Callable, dt: float) -> tuple[float, float]:

@@ -6,26 +6,28 @@ that is asked for, which is then verified by a run. Only what can still win is v
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+from tqdm import tqdm
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.adaptive import adaptive
 from physjax.stepping.methods import METHODS, rk4
-from physjax.stepping.reference import cast_floats
-from physjax.stepping.simulate import simulate
+from physjax.study.accuracy.compiled_run import CompiledRun, compile_run, draw_random_push
 from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure, path
-from physjax.study.accuracy.method_facts import (
-    CompiledRun,
-    compile_run,
-    depends_on_velocity,
-    draw_random_push,
-    method_title,
-    promised_order,
+from physjax.study.accuracy.method_facts import depends_on_velocity, method_title, promised_order, read_promises
+from physjax.study.accuracy.options import SearchOptions, merge_options
+from physjax.study.accuracy.reasons import (
+    SAFE_ERROR_SHARE,
+    TRUTH_ERROR_SHARE,
+    explain_choice,
+    explain_failure,
+    is_float32_accurate,
 )
+from physjax.study.accuracy.recommendation import Choice, Recommendation
 from physjax.study.accuracy.reference_solution import solve_reference
 from physjax.study.accuracy.search import (
     MAX_RUN_SECONDS,
@@ -36,99 +38,19 @@ from physjax.study.accuracy.search import (
     explore_method,
     refine_step,
     run_trial,
-    time_in_turn,
+    time_finalists,
 )
 from physjax.study.problem import Problem
-from physjax.text import format_seconds, format_table, progress_bar
-from physjax.trajectory import Trajectory
+from physjax.text import progress_bar
 
-SAFE_ERROR_SHARE = {"float64": 0.9, "float32": 0.6}
-"""The part of an error that a run may have to be recommended; rounding differs from one compilation to the next."""
-TRUTH_ERROR_SHARE = 0.3
-"""An error can be promised if the truth itself is right to this part of it."""
-CHAOTIC_GROWTH = 1e6
-"""So many times an error of the start has grown where one speaks of chaos; what drifts apart in time stays below."""
 MAX_FINALISTS, FINALIST_TIME_RATIO = 3, 4.0
-"""Methods that are verified and timed for an error, by what their runs predict, if not so many times slower than others."""
-
-
-class Choice(NamedTuple):
-    """A way to run the scene that keeps the error: `error` as measured, `seconds` for each second simulated.
-
-    `dt` [s]; `tolerance` is that of a method that chooses its own steps inside dt, otherwise None.
-    """
-
-    name: str
-    method: Any
-    dtype: str
-    dt: float
-    steps_per_frame: int
-    tolerance: float | None
-    error: float
-    seconds: float
-
-    @property
-    def step(self) -> str:
-        """Step or tolerance in words."""
-        return format_seconds(self.dt) if self.tolerance is None else f"tolerance {self.tolerance:.1e}"
-
-
-class Recommendation(NamedTuple):
-    """What to run for an error over a horizon [s], why, and what else would do. Printed, it is a table and a sentence.
-
-    `best` is None, and `reason` says what stops it, where nothing keeps the error. `richardson` is the error of the best
-    as its own run with half the step tells it, `truth_error` that of the truth; `untried` the methods for which there was no
-    time.
-    """
-
-    scene: Scene
-    error: float
-    horizon: float
-    frames: int
-    norm: str
-    best: Choice | None
-    runners_up: tuple[Choice, ...]
-    reason: str
-    truth: str
-    truth_error: float
-    richardson: float
-    untried: tuple[str, ...]
-
-    @property
-    def ok(self) -> bool:
-        """Whether anything keeps the error."""
-        return self.best is not None
-
-    @property
-    def evidence(self) -> str:
-        """How the error of the best is known."""
-        if self.best is None:
-            return f"truth: {self.truth}, itself right to {self.truth_error:.1e}"
-        remarks = "" if np.isnan(self.richardson) else f"; against its own half step it reads {self.richardson:.1e}"
-        return f"{self.best.error:.1e} measured against {self.truth}, itself right to {self.truth_error:.1e}{remarks}"
-
-    def simulate(self, **options: Any) -> Trajectory:
-        """Run the scene as recommended, over the horizon; options as for `simulate`. ValueError where nothing keeps the error."""
-        if self.best is None:
-            raise ValueError(f"recommend: nothing keeps an error of {self.error:g}: {self.reason}")
-        best, steps = self.best, self.best.steps_per_frame
-        with jax.enable_x64(best.dtype == "float64"):
-            scene = cast_floats(self.scene, best.dtype)
-            options = {"save_every": steps} | options
-            return simulate(scene, best.method, dt=best.dt, steps=steps * self.frames, **options)
-
-    def __str__(self) -> str:
-        title = f"error {self.error:g} ({self.norm}) over {format_seconds(self.horizon)}"
-        rows = [
-            [c.name, c.dtype, c.step, f"{c.error:.1e}", format_seconds(c.seconds)]
-            for c in (self.best, *self.runners_up)
-            if c is not None
-        ]
-        body = (
-            [format_table(["method", "float", "step", "error", "run time per s"], rows, align="<<>>>")] if rows else []
-        )
-        rest = [f"Not tried for lack of time: {', '.join(self.untried)}."] if self.untried else []
-        return "\n".join([title, *body, f"{self.reason}", f"Evidence: {self.evidence}.", *rest])
+"""Methods that are verified and timed for an error, by what their runs predict, if at most this many times slower than others."""
+REFERENCE_TIME_SHARE = 0.2
+"""Share of the search's time that the true path may take, where our own steps are refined for it."""
+FLOAT32_FINENESS_FACTORS = (1.0, 1.25)
+"""How much finer than in float64 a run in float32 is tried: its rounding takes a part of the error."""
+LARGEST_COMPARED_LIMIT = 1e6
+"""Stands for an infinite stability limit where methods are compared, so that two that are always stable are equals."""
 
 
 def recommend(
@@ -137,24 +59,21 @@ def recommend(
     error: float | Sequence[float],
     horizon: float,
     norm: ErrorMeasure | Callable = path,
-    gradient: bool = False,
-    scale: Any = None,
     methods: Sequence[Callable] | None = None,
-    dtypes: Sequence[Any] = (np.float64, np.float32),
-    frames: int = 32,
     seconds: float = 15.0,
-    progress: bool = True,
+    options: SearchOptions = SearchOptions(),  # noqa: B008  a record that nothing changes
+    **more: object,
 ) -> Recommendation | tuple[Recommendation, ...]:
     """The fastest way to run a scene for `horizon` [s] with at most this `error`; for several errors a tuple, by one search.
 
-    Errors are relative to the extent of the true path (`norm`: see `norms`; or a function (times, states) of your
-    own), or in units of `scale`, at `frames` equally spaced moments. The truth is diffrax's Dopri8; with contacts,
-    forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson: the answer
-    says which. `methods`: the registry and adaptive rk4, unless given; those that promise no more than another in any
-    respect are left out, adaptive ones also where touches are answered at the end of a step, implicit ones where no
-    error leaves the step to stability. With `gradient` the derivative of the path by the start's velocity, in a
-    random direction, must keep the error as well, and its time by forward mode counts. `seconds` of processor time
-    bound the search: what is not reached is said.
+    Errors are relative to the extent of the true path (`norm`: see `accuracy.path` and its neighbours; or your own
+    function (times, states)), or in units of `scale`, at `frames` equally spaced moments. The truth is diffrax's Dopri8;
+    with contacts, forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson:
+    the answer says which. `methods`: the registry and adaptive rk4, unless given; those that promise no more than another
+    in any respect are left out, adaptive ones also where contacts are resolved at the end of a step, implicit ones where
+    accuracy limits the step before stability does. `seconds` of processor time bound the search: what is not reached is
+    reported. Everything rarer is a field of `accuracy.SearchOptions`, accepted as a keyword as well: `gradient`, `scale`,
+    `dtypes`, `frames`, `progress`.
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
 
     Example:
@@ -164,31 +83,23 @@ def recommend(
         >>> advice.best.name, advice.best.error < 1e-3
         ('verlet', True)
     """
-    problem, errors = _check_request(scene, error, horizon, frames)
-    norm, dtypes = as_error_measure(norm), [np.dtype(dtype).name for dtype in dtypes]
+    options = merge_options("recommend", options, more)
+    problem, errors = _check_request(scene, error, horizon, options.frames)
+    norm, dtypes = as_error_measure(norm), [np.dtype(dtype).name for dtype in options.dtypes]
     deadline = time.process_time() + float(as_real_quantity("seconds [s]", seconds, above=0.0))
-    with jax.enable_x64(True), progress_bar(progress=progress, desc="recommend", unit="method", leave=False) as shown:
-        shown.set_postfix_str("the true path")
-        push = draw_random_push(scene) if gradient else None
-        truth = solve_reference(problem, wanted=min(errors), seconds=seconds / 5, push=push)
-        task = SearchTask(problem, truth, norm, scale, push, deadline)
-        truth_error = float(truth.truth_error(norm, scale).max())
-        found, untried = _explore_methods(
-            task, list_candidates(scene) if methods is None else list(methods), min(errors), shown
-        )
-        answers, compiled = [], {}
-        for wanted in errors:
-            shown.set_postfix_str(f"error {wanted:g}")
-            kept = (
-                _verify_finalists(task, found, wanted, truth_error, dtypes, compiled)
-                if truth_error < TRUTH_ERROR_SHARE * wanted
-                else []
-            )
-            answers.append(_build_recommendation(task, found, kept, wanted, truth_error, untried))
+    shown = progress_bar(progress=options.progress, desc="recommend", unit="method", leave=False)
+    with jax.enable_x64(True), shown as bar:
+        bar.set_postfix_str("the true path")
+        push = draw_random_push(scene) if options.gradient else None
+        truth = solve_reference(problem, wanted=min(errors), seconds=REFERENCE_TIME_SHARE * seconds, push=push)
+        task = SearchTask(problem, truth, norm, options.scale, push, deadline)
+        tried = list_candidates(scene) if methods is None else list(methods)
+        found, untried = _explore_methods(task, tried, min(errors), bar)
+        answers = _answer_errors(task, found, errors, dtypes, untried, bar)
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
 
 
-def _check_request(scene: Scene, error: Any, horizon: float, frames: int) -> tuple[Problem, list[float]]:
+def _check_request(scene: Scene, error: ArrayLike, horizon: float, frames: int) -> tuple[Problem, list[float]]:
     if not isinstance(scene, Scene):
         raise TypeError(f"recommend: got a {type(scene).__name__}, expected a Scene.")
     as_real_quantity("error", error, above=0.0)
@@ -202,33 +113,40 @@ def _check_request(scene: Scene, error: Any, horizon: float, frames: int) -> tup
 
 
 def list_candidates(scene: Scene) -> list[Callable]:
-    """Methods for a scene in the order in which they are tried: what is likely to win first, what cannot win not at all."""
-    late, pulled = scene.resolves_at_step_end, depends_on_velocity(scene)
+    """Methods for a scene in the order in which they are tried: the likely winners first, without those that cannot win."""
+    late, velocity_dependent = scene.resolves_at_step_end, depends_on_velocity(scene)
 
-    def merit(method):
-        promises = method.promises
-        return promised_order(method, pulled, scene), -promises.evaluations, min(promises.stability_limit, 1e6)
+    def rate_merit(method: Callable) -> tuple[float, ...]:
+        promises = read_promises(method)
+        limit = min(promises.stability_limit, LARGEST_COMPARED_LIMIT)
+        return promised_order(method, velocity_dependent, scene), -promises.evaluations, limit
 
-    chosen = []
-    # what is implicit does not end by stability and costs more than its promise says: last
-    for method in sorted(METHODS.values(), key=lambda m: (_is_implicit(m), *(-x for x in merit(m)))):
-        if not any(all(a >= b for a, b in zip(merit(other), merit(method), strict=True)) for other in chosen):
+    chosen: list[Callable] = []
+    # implicit methods do not end by stability and cost more than their promise says: last
+    for method in sorted(METHODS.values(), key=lambda m: (_is_implicit(m), *(-x for x in rate_merit(m)))):
+        merit = rate_merit(method)
+        if not any(all(a >= b for a, b in zip(rate_merit(other), merit, strict=True)) for other in chosen):
             chosen.append(method)
+    # adaptive steps cannot see an error that a contact makes at the end of a step
     return chosen if late else [*chosen[:2], adaptive(rk4), *chosen[2:]]
 
 
-def _explore_methods(task: SearchTask, methods: Sequence, least: float, bar: Any) -> tuple[list, tuple[str, ...]]:
+def _is_implicit(method: Callable) -> bool:
+    promises = read_promises(method)
+    return promises is not None and bool(np.isinf(promises.stability_limit))
+
+
+def _explore_methods(
+    task: SearchTask, methods: Sequence[Callable], least: float, bar: tqdm
+) -> tuple[list[Exploration], tuple[str, ...]]:
     """The runs of every method, as long as there is time, and the names of those for which there was none."""
     found: list[Exploration] = []
     untried, longest = [], 0.0
     for method in methods:
         name = method_title(method)
         bar.set_postfix_str(name)
-        if (
-            _is_implicit(method)
-            and not any(np.isfinite(entry.longest_stable_step) for entry in found if entry.trials)
-            and found
-        ):
+        any_unstable = any(np.isfinite(entry.longest_stable_step) for entry in found if entry.trials)
+        if _is_implicit(method) and found and not any_unstable:
             continue  # no step was too long for the others, so stability costs nothing here
         # as much again is needed to verify
         if found and 2 * longest > task.time_left():
@@ -242,26 +160,52 @@ def _explore_methods(task: SearchTask, methods: Sequence, least: float, bar: Any
     return found, tuple(untried)
 
 
-def _is_implicit(method: Any) -> bool:
-    promises = getattr(method, "promises", None)
-    return promises is not None and bool(np.isinf(promises.stability_limit))
-
-
 def _guess_fineness(found: Sequence[Exploration], entry: CompiledRun) -> float:
-    """The coarsest number of steps worth a run: twice as long as the longest that held for a method like it."""
-    reach = lambda method: getattr(getattr(method, "promises", None), "stable_to", 0.0)  # noqa: E731
-    mine = reach(entry.method)
+    """The coarsest number of steps worth a run: with twice the step that was stable for a method with a like limit."""
+
+    def read_limit(method: Callable) -> float:
+        promises = read_promises(method)
+        return 0.0 if promises is None else promises.stability_limit
+
+    mine = read_limit(entry.method)
     limits = [
-        e.longest_stable_step * mine / reach(e.compiled_run.method)
+        e.longest_stable_step * mine / read_limit(e.compiled_run.method)
         for e in found
-        if np.isfinite(e.longest_stable_step) and reach(e.compiled_run.method)
+        if np.isfinite(e.longest_stable_step) and read_limit(e.compiled_run.method)
     ]
+    if not limits or not 0 < mine < np.inf:
+        return 1.0
     spacing = entry.problem.duration / entry.problem.frames
-    return max(1.0, float(2.0 ** np.floor(np.log2(spacing / min(limits) / 2)))) if limits and 0 < mine < np.inf else 1.0
+    return max(1.0, float(2.0 ** np.floor(np.log2(spacing / min(limits) / 2))))
+
+
+def _answer_errors(
+    task: SearchTask,
+    found: list[Exploration],
+    errors: Sequence[float],
+    dtypes: Sequence[str],
+    untried: tuple[str, ...],
+    bar: tqdm,
+) -> list[Recommendation]:
+    """A recommendation for each error, from the runs of all methods."""
+    truth_error = float(task.truth.truth_error(task.norm, task.scale).max())
+    answers, compiled = [], {}
+    for wanted in errors:
+        bar.set_postfix_str(f"error {wanted:g}")
+        kept = []
+        if truth_error < TRUTH_ERROR_SHARE * wanted:
+            kept = _verify_finalists(task, found, wanted, truth_error, dtypes, compiled)
+        answers.append(_build_recommendation(task, found, kept, wanted, truth_error, untried))
+    return answers
 
 
 def _verify_finalists(
-    task: SearchTask, found: list[Exploration], wanted: float, truth_error: float, dtypes: Sequence[str], compiled: dict
+    task: SearchTask,
+    found: list[Exploration],
+    wanted: float,
+    truth_error: float,
+    dtypes: Sequence[str],
+    compiled: dict[str, CompiledRun],
 ) -> list[tuple[CompiledRun, Trial]]:
     """The runs that keep an error, at most one of each method and float type, of those that may be the fastest."""
     goals = {dtype: SAFE_ERROR_SHARE[dtype] * wanted - truth_error for dtype in SAFE_ERROR_SHARE}
@@ -274,18 +218,14 @@ def _verify_finalists(
         most = min(most, FINALIST_TIME_RATIO * trial.seconds)
         if "float64" in dtypes:
             kept.append((found[i].compiled_run, trial))
-        if "float32" in dtypes and _is_float32_accurate(task, wanted):
+        if "float32" in dtypes and is_float32_accurate(task, wanted):
             kept += _try_float32(task, found[i], trial, goals["float32"], compiled)
     return kept
 
 
-def _is_float32_accurate(task: SearchTask, wanted: float) -> bool:
-    """Whether rounding in float32, grown as errors of the start grow, stays below the error."""
-    eps = float(np.finfo(np.float32).eps)
-    return float(task.truth.growth(task.norm, task.scale).max(initial=1.0)) * eps < wanted
-
-
-def _try_float32(task: SearchTask, entry: Exploration, trial: Trial, goal: float, compiled: dict) -> list:
+def _try_float32(
+    task: SearchTask, entry: Exploration, trial: Trial, goal: float, compiled: dict[str, CompiledRun]
+) -> list[tuple[CompiledRun, Trial]]:
     """The same method in float32, as fine as it must be there, if it keeps the error and there is time to compile it."""
     wide = entry.compiled_run
     if wide.adaptive and trial.fineness * float(np.finfo(np.float32).eps) > 1:
@@ -295,7 +235,7 @@ def _try_float32(task: SearchTask, entry: Exploration, trial: Trial, goal: float
             return []
         compiled[wide.name] = compile_run(task.problem, wide.method, np.float32, push=task.push)
     narrow = compiled[wide.name]
-    for factor in (1.0, 1.25):
+    for factor in FLOAT32_FINENESS_FACTORS:
         found = run_trial(task, narrow, trial.fineness * factor)
         if found.error <= goal:
             return [(narrow, found)]
@@ -303,18 +243,19 @@ def _try_float32(task: SearchTask, entry: Exploration, trial: Trial, goal: float
 
 
 def _build_recommendation(
-    task: SearchTask, found: list[Exploration], kept: list, wanted: float, truth_error: float, untried: tuple[str, ...]
+    task: SearchTask,
+    found: list[Exploration],
+    kept: list[tuple[CompiledRun, Trial]],
+    wanted: float,
+    truth_error: float,
+    untried: tuple[str, ...],
 ) -> Recommendation:
-    """The fastest of what keeps the error, by times taken in turn, with the reason; or what stops it."""
+    """The fastest of the runs that keep the error, by times taken in turn, with the reason; or what stops it."""
     problem = task.problem
-    seconds = time_in_turn(kept)
+    seconds = time_finalists(kept)
     ranked = sorted(range(len(kept)), key=lambda i: seconds[i])
     choices = tuple(_build_choice(*kept[i], seconds[i]) for i in ranked)
-    reason = (
-        _explain_choice(choices, kept[ranked[0]][0], found)
-        if kept
-        else _explain_failure(task, found, wanted, truth_error)
-    )
+    stopped = None if kept else explain_failure(task, found, wanted, truth_error)
     return Recommendation(
         scene=problem.scene,
         error=wanted,
@@ -323,7 +264,7 @@ def _build_recommendation(
         norm=task.norm.name + (" and its gradient" if task.push is not None else ""),
         best=choices[0] if choices else None,
         runners_up=choices[1:],
-        reason=reason,
+        reason=stopped or explain_choice(choices, kept[ranked[0]][0], found),
         truth=task.truth.source,
         truth_error=truth_error,
         richardson=estimate_richardson_error(task, *kept[ranked[0]]) if kept else float("nan"),
@@ -342,44 +283,3 @@ def _build_choice(entry: CompiledRun, trial: Trial, seconds: float) -> Choice:
         error=trial.error,
         seconds=seconds / entry.problem.duration,
     )
-
-
-def _explain_choice(choices: tuple[Choice, ...], winner: CompiledRun, found: list[Exploration]) -> str:
-    """One sentence: the choice, the longest step that holds, and who comes next."""
-    best, *others = choices
-    longest_stable_step = next(entry.longest_stable_step for entry in found if entry.compiled_run.name == winner.name)
-    remarks = [f"steps up to {format_seconds(longest_stable_step)} hold"] if np.isfinite(longest_stable_step) else []
-    other = next((c for c in others if c.name != best.name), None)
-    if other is not None:
-        remarks.append(f"{other.name} takes {other.seconds / best.seconds:.1f} times as long at this error")
-    else:
-        remarks.append("no other method came near in time")
-    return f"{best.name} at {best.step} in {best.dtype}: {', '.join(remarks)}."
-
-
-def _explain_failure(task: SearchTask, found: list[Exploration], wanted: float, truth_error: float) -> str:
-    """Why nothing keeps an error."""
-    scene, truth = task.problem.scene, task.truth
-    horizon = truth.horizon(wanted, 10 * float(np.finfo(float).eps), task.norm, task.scale)
-    least = min((t.error for entry in found for t in entry.trials), default=np.inf)
-    if np.isfinite(horizon):
-        grown = float(truth.growth(task.norm, task.scale).max())
-        what = "Chaos" if grown > CHAOTIC_GROWTH else "Rounding"
-        return f"{what}: beyond {format_seconds(horizon)} rounding alone has grown to an error of {wanted:g}; no method can."
-    if truth_error > TRUTH_ERROR_SHARE * wanted:
-        cause = "springs that break" if scene.has_memory else "touches answered at the end of a step"
-        why = f" ({cause} leave every method at first order)" if scene.resolves_at_step_end else ""
-        unit, kind = truth.find_least_certain(task.norm, task.scale), "scene" if scene.couples else "lane"
-        where = "" if unit is None else f", worst in {kind} {unit}"
-        return f"The true path itself is known only to {truth_error:.1e}{where}{why}; {wanted:g} cannot be promised."
-    if least <= SAFE_ERROR_SHARE["float64"] * wanted - truth_error:
-        what = (
-            "no time was left to compile it in float32"
-            if _is_float32_accurate(task, wanted)
-            else "float32 rounds too much"
-        )
-        return f"In float64 an error of {wanted:g} is kept, but {what}. Allow float64 by dtypes."
-    ended = "of the search" if task.time_left() < 0 else f"a run may take ({MAX_RUN_SECONDS:g} s)"
-    if not np.isfinite(least):
-        return f"No run held in the time {ended}. Give it more seconds, or fewer lanes: a few tell the error of many."
-    return f"No method came below {least:.1e} in the time {ended}; {wanted:g} was asked for."

@@ -1,75 +1,82 @@
-"""The true path that errors are measured by, with its own doubt, and how far the start's rounding carries.
+"""The true path that errors are measured against, its own error, and how fast errors of the start grow along it.
 
 A closed form where there is one; else diffrax; else, through contacts, with forces that remember and where the state is
-so large that diffrax would take minutes, our own rk4 with far finer steps, whose last refinement tells how wrong it still
-is (Richardson).
+so large that diffrax would take minutes, our own rk4 with far finer steps, whose last refinement shows its remaining
+error (Richardson).
 """
 
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, PyTree
 
 from physjax.scene import Scene
 from physjax.stepping.methods import rk4
 from physjax.stepping.reference import build_default_solver, cast_floats, solve_ode
+from physjax.study.accuracy.compiled_run import CompiledRun, compile_run
 from physjax.study.accuracy.error_measures import ErrorMeasure, extent, path
-from physjax.study.accuracy.method_facts import CompiledRun, compile_run, smallest_sizes
+from physjax.study.accuracy.method_facts import smallest_sizes
 from physjax.study.problem import Problem
 from physjax.text import format_seconds
 
 EXTENT_TOLERANCE = 1e-6
-"""Tolerance of a glance at how far a path goes."""
+"""Tolerance of the quick solution that shows how far a path goes."""
 TIGHT_TOLERANCE, LOOSE_TOLERANCE = 1e-13, 4e-13
 """Tolerances of the two references through diffrax: their steps differ by a tenth, and so do their errors."""
 MAX_DIFFRAX_NUMBERS = 20_000
-"""Numbers in a state beyond which nobody waits for diffrax at such tolerances: a thousand ropes take a quarter of an hour."""
+"""Numbers in a state beyond which diffrax takes too long at such tolerances: a thousand ropes take a quarter of an hour."""
 FIRST_STEPS_PER_FRAME = 8
 """Steps between two moments with which our own reference begins; they are doubled."""
 NUDGE_SHARE = 1e-10
-"""The change of the start, in parts of the path, whose growth is looked at: far from rounding and from curvature."""
+"""The change of the start, relative to the path, whose growth is measured: far from rounding and from curvature."""
 NUDGE_RATIO = 10.0
-"""The parts of a nudge that growth is confirmed by: what is a nudge's doing is then as many times smaller."""
+"""A second nudge, this many times smaller, confirms growth: what the nudge has caused is then as many times smaller."""
 SATURATED_SHARE = 1e-3
-"""What it has become, in parts of the path, when it no longer grows like a small one."""
+"""The size of a deviation, relative to the path, from which it no longer grows like a small one."""
 INTERMEDIATE_TIME_RATIO = (1 + 5**0.5) / 4
-"""Moments so many times as close together see what a motion does between the moments, whatever its period."""
+"""Moments this many times as far apart see what a motion does between the moments: an irrational ratio, whatever its period."""
 ROUNDING_EXTENT_SHARE = 1e-12
-"""An extent, in parts of the distance from the origin, that is rounding."""
+"""An extent, relative to the distance from the origin, that is rounding."""
+CONVERGED_ERROR_SHARE = 1 / 50
+"""Our own solution is fine enough when a refinement changes it by this share of the error that is to be measured."""
+MAX_EXPONENT = 700.0
+"""Exponents beyond this overflow float64."""
 
 
 class ReferenceSolution(NamedTuple):
-    """States at the moments, those of a second and less fine solution, and those from a start that was nudged.
+    """States at the moments, those of a second, coarser solution, and those from a start that was nudged.
 
-    `second` and `nudged` are None where the states are a closed form. `slopes` are what becomes of a push of the start.
+    `second` and `nudged` are None where the states are a closed form. `slopes` is the derivative along a push of the start.
     `reach` is how far each unit goes, at the moments and in between. `less_nudged()` solves from a start that was nudged
     by a tenth of that.
     """
 
     scene: Scene
     times: np.ndarray
-    states: Any
-    second: Any
-    nudged: Any
-    slopes: Any
+    states: PyTree
+    second: PyTree
+    nudged: PyTree
+    slopes: PyTree
     source: str
     reach: np.ndarray | None = None
-    less_nudged: Callable | None = None
+    less_nudged: Callable[[], PyTree] | None = None
 
-    def truth_error(self, norm: ErrorMeasure = path, scale: Any = None) -> np.ndarray:
+    def truth_error(self, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> np.ndarray:
         """How far the truth itself may be wrong at each moment, `(moments,)`; 0 for a closed form."""
-        # where moments are close the two take the same steps: an error of the tolerance is then what grows
+        # where moments are close the two solutions take the same steps and agree: then an error of the tolerance grows
         return np.maximum(self._measure_deviation(self.second, norm, scale), TIGHT_TOLERANCE * self.growth(norm, scale))
 
-    def growth(self, norm: ErrorMeasure = path, scale: Any = None) -> np.ndarray:
-        """How many times larger a small error of the start has become at each moment; 1: it moves along."""
+    def growth(self, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> np.ndarray:
+        """The factor by which a small error of the start has grown at each moment; 1: it moves along."""
         return self._measure_deviation(self.nudged, norm, scale) / NUDGE_SHARE
 
-    def horizon(self, error: float, eps: float, norm: ErrorMeasure = path, scale: Any = None) -> float:
+    def horizon(self, error: float, eps: float, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> float:
         """The first moment [s] at which rounding of size `eps` has grown beyond an error; infinite if it does not.
 
         Where the nudged path is not known, or as far away when nudged by a tenth, nothing is known to have grown.
@@ -80,54 +87,57 @@ class ReferenceSolution(NamedTuple):
         times = self.times[len(self.times) - len(growth) :]
         grown = growth * NUDGE_SHARE > SATURATED_SHARE
         if grown.any():
-            # two paths that have parted part no further; rounding is still smaller, and grows on as the nudge did
+            # two paths as far apart as the path is long separate no further; rounding is still small, and keeps growing at
+            # the rate that the nudge grew with until then
             since = int(np.argmax(grown))
             rate = np.log(growth[since]) / times[since]
-            growth = np.where(np.arange(len(times)) < since, growth, np.exp(np.minimum(rate * times, 700.0)))
+            growth = np.where(np.arange(len(times)) < since, growth, np.exp(np.minimum(rate * times, MAX_EXPONENT)))
         over = growth * eps > error
         if not over.any() or not self._is_proportional(norm, scale):
             return float("inf")
         return float(times[int(np.argmax(over))])
 
-    def find_least_certain(self, norm: ErrorMeasure = path, scale: Any = None) -> int | None:
-        """The unit (lane, or coupled scene) whose truth is most in doubt; None where there is one only, or none."""
+    def find_least_certain(self, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> int | None:
+        """The unit (lane, or coupled scene) whose truth is least certain; None where there is one only, or a closed form."""
         if self.second is None:
             return None
         off = norm.units(self.scene, self.times, self.second, self.states, self.size(norm, scale))
         worst = np.where(np.isfinite(off), off, np.inf).max(axis=0)
         return int(np.argmax(worst)) if worst.size > 1 else None
 
-    def size(self, norm: ErrorMeasure, scale: Any) -> Any:
-        """What errors are parts of, where no scale is given: how far the path goes in between the moments as well."""
+    def size(self, norm: ErrorMeasure, scale: ArrayLike | None) -> ArrayLike | None:
+        """What errors are relative to, where no scale is given: how far the path goes in between the moments as well."""
         return self.reach if scale is None and norm.size is extent else scale
 
-    def _is_proportional(self, norm: ErrorMeasure, scale: Any) -> bool:
-        """Whether a smaller nudge leads less far away, in the last moment in which the larger was still small."""
+    def _is_proportional(self, norm: ErrorMeasure, scale: ArrayLike | None) -> bool:
+        """Whether a smaller nudge leads less far away, at the last moment at which the larger was still small.
+
+        Where it does not, as with dry friction, the deviation is noise of the solver and says nothing about growth.
+        """
         if self.less_nudged is None:
             return True
-        far, near = (
-            self._measure_deviation(self.nudged, norm, scale),
-            self._measure_deviation(self.less_nudged(), norm, scale),
-        )
+        far = self._measure_deviation(self.nudged, norm, scale)
+        near = self._measure_deviation(self.less_nudged(), norm, scale)
         small = (far > 0) & (far < SATURATED_SHARE)
         if not small.any():
             return True
         last = np.flatnonzero(small)[-1]
+        # halfway, as logarithms go, between in proportion and not at all
         return bool(near[last] < far[last] / NUDGE_RATIO**0.5)
 
-    def _measure_deviation(self, other: Any, norm: ErrorMeasure, scale: Any) -> np.ndarray:
+    def _measure_deviation(self, other: PyTree, norm: ErrorMeasure, scale: ArrayLike | None) -> np.ndarray:
         if other is None:
             return np.zeros(len(self.times))
         return norm.moments(self.scene, self.times, other, self.states, self.size(norm, scale))
 
 
 def solve_reference(
-    problem: Problem, *, wanted: float = 1e-8, seconds: float = 3.0, push: Any = None, own: Callable | None = None
+    problem: Problem, *, wanted: float = 1e-8, seconds: float = 3.0, push: PyTree = None, own: Callable | None = None
 ) -> ReferenceSolution:
-    """The true path of a problem at its moments, its doubt well below the error `wanted` if the processor has `seconds` [s].
+    """The true path of a problem at its moments, its own error well below `wanted` if that takes the processor `seconds` [s].
 
     Inside `jax.enable_x64(True)`. Our own solution is refined until the last refinement changes it by less than a
-    fiftieth of what is wanted; by `own`, a method, where given: for a second truth.
+    fiftieth of `wanted`; by the method `own` where given, for a second truth.
     """
     scene = cast_floats(problem.scene, jnp.float64)
     if problem.exact is not None and push is None and own is None:
@@ -142,103 +152,99 @@ def solve_reference(
             "closed form",
             _measure_reach(scene, problem.times, states, between),
         )
-    by_diffrax = (
-        problem.is_ode
-        and own is None
-        and sum(leaf.size for leaf in jax.tree.leaves(scene.state)) <= MAX_DIFFRAX_NUMBERS
-    )
+    few = sum(leaf.size for leaf in jax.tree.leaves(scene.state)) <= MAX_DIFFRAX_NUMBERS
     found = None
-    if by_diffrax:
-        # what an adaptive solver gives up at, such as a force that chatters about zero, equal steps walk through
+    if problem.is_ode and own is None and few:
+        # equal steps get through where an adaptive solver gives up, such as a force that switches about zero
         found = _build_reference(problem, scene, *_make_diffrax_solver(problem, push), strict=True)
     return found or _build_reference(problem, scene, *_make_own_solver(problem, own or rk4, wanted, seconds, push))
 
 
 def _build_reference(
-    problem: Problem, scene: Scene, solve: Callable, glance: Callable, strict: bool = False
+    problem: Problem, scene: Scene, solve: Callable, sample_between: Callable, strict: bool = False
 ) -> ReferenceSolution | None:
-    """What a solver knows of a problem; where it is `strict` None if any of that is not finite."""
+    """The reference that a solver gives for a problem; where it is `strict`, None if any of that is not finite."""
     finite = lambda tree: not strict or all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))  # noqa: E731
     states, second, slopes, source = solve(scene)
     if not finite((states, second)):
         return None
-    between = glance(scene)
+    between = sample_between(scene)
     if not finite(between):
         return None
-    seen = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, between)
-    part = lambda size: solve(nudged(scene, seen, size), alone=True)[0]  # noqa: E731
+    visited = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, between)
+    solve_nudged = lambda share: solve(nudge_start(scene, visited, share), alone=True)[0]  # noqa: E731
     reach = _measure_reach(scene, problem.times, states, between)
-    less, moved = partial(part, NUDGE_SHARE / NUDGE_RATIO), part(NUDGE_SHARE)
+    less, moved = partial(solve_nudged, NUDGE_SHARE / NUDGE_RATIO), solve_nudged(NUDGE_SHARE)
     if not finite(moved):
         return None
     return ReferenceSolution(scene, problem.times, states, second, moved, slopes, source, reach, less)
 
 
-def _measure_reach(scene: Scene, times: np.ndarray, *paths: Any) -> np.ndarray:
+def _measure_reach(scene: Scene, times: np.ndarray, *paths: PyTree) -> np.ndarray:
     """How far each unit ever is from where it began, on all of the paths; 0 where that is rounding."""
     far = np.fmax.reduce([extent(scene, times, states) for states in paths])
     place = np.abs(np.asarray(paths[0].place[0])).max(axis=(-2, -1) if scene.couples else -1)
     return np.where(far > ROUNDING_EXTENT_SHARE * place.reshape(far.shape), far, 0.0)
 
 
-def nudged(scene: Scene, states: Any, part: float = NUDGE_SHARE) -> Scene:
-    """The scene with its velocities (of bodies, momenta) changed at random, by a part of the largest on each lane's path.
+def nudge_start(scene: Scene, states: PyTree, share: float = NUDGE_SHARE) -> Scene:
+    """The scene with its velocities (of bodies, momenta) changed at random, by a share of the largest on each lane's path.
 
     Lanes that are coupled have their largest in common.
     """
     rng = np.random.default_rng(0)
 
-    def random(leaf, over):
-        lasting = np.abs(np.asarray(over)).max(axis=0)
-        largest = lasting.max(axis=(-2, -1) if scene.couples else -1, keepdims=True)
+    def draw_change(leaf: Array, over: np.ndarray) -> Array:
+        over_time = np.abs(np.asarray(over)).max(axis=0)
+        largest = over_time.max(axis=(-2, -1) if scene.couples else -1, keepdims=True)
         return jnp.asarray(rng.normal(size=leaf.shape) * largest)
 
-    state = scene.kick(scene.state, jax.tree.map(random, scene.state, states), part)
+    state = scene.kick(scene.state, jax.tree.map(draw_change, scene.state, states), share)
     return scene.replace(state=state if scene.held is None else state.hold_lanes(1 - scene.held.astype(state.dtype)))
 
 
-def _make_diffrax_solver(problem: Problem, push: Any) -> tuple[Callable, Callable]:
-    """Dopri8 at two tolerances, and a glance in between the moments; compiles once."""
+def _make_diffrax_solver(problem: Problem, push: PyTree) -> tuple[Callable, Callable]:
+    """Dopri8 at two tolerances, and a quick solution in between the moments; compiles once."""
     times, end = jnp.asarray(problem.times), jnp.asarray(problem.duration)
-    size = jnp.asarray(smallest_sizes(cast_floats(problem.scene, jnp.float64)))  # not a nudged one's, which may be tiny
+    # sizes of the scene as given: those of a nudged one that starts at rest are tiny
+    size, solver = jnp.asarray(smallest_sizes(cast_floats(problem.scene, jnp.float64))), build_default_solver()
 
-    def once(scene, tolerance, times=times):
-        run = lambda state: solve_ode(  # noqa: E731
-            scene.replace(state=state), times, end, jnp.asarray(tolerance), jnp.asarray(tolerance * size), build_default_solver(), True
-        )[0]  # fmt: skip
+    def solve_at(scene: Scene, tolerance: float, times: Array = times) -> tuple[PyTree, PyTree]:
+        rtol, atol = jnp.asarray(tolerance), jnp.asarray(tolerance * size)
+        run = lambda state: solve_ode(scene.replace(state=state), times, end, rtol, atol, solver, True)[0]  # noqa: E731
         return (run(scene.state), None) if push is None else jax.jvp(run, (scene.state,), (push,))
 
-    def solve(scene, alone=False):
-        states, slopes = jax.tree.map(np.asarray, once(scene, TIGHT_TOLERANCE))
+    def solve(scene: Scene, alone: bool = False) -> tuple[PyTree, PyTree, PyTree, str]:
+        states, slopes = jax.tree.map(np.asarray, solve_at(scene, TIGHT_TOLERANCE))
         good = not alone and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(states))
-        second = jax.tree.map(np.asarray, once(scene, LOOSE_TOLERANCE))[0] if good else None
+        second = jax.tree.map(np.asarray, solve_at(scene, LOOSE_TOLERANCE))[0] if good else None
         return states, second, slopes, f"diffrax Dopri8, tolerance {TIGHT_TOLERANCE:.0e}"
 
     return solve, lambda scene: jax.tree.map(
-        np.asarray, once(scene, EXTENT_TOLERANCE, INTERMEDIATE_TIME_RATIO * times)[0]
+        np.asarray, solve_at(scene, EXTENT_TOLERANCE, INTERMEDIATE_TIME_RATIO * times)[0]
     )
 
 
 def _make_own_solver(
-    problem: Problem, method: Callable, wanted: float, seconds: float, push: Any
+    problem: Problem, method: Callable, wanted: float, seconds: float, push: PyTree
 ) -> tuple[Callable, Callable]:
-    """Our own method, twice as fine again and again, until it no longer changes by what matters, or time is up.
+    """Our own method with twice the steps again and again, until it no longer changes by what matters, or time is up.
 
-    And a glance in between the moments, half as fine.
+    And a quick solution in between the moments, half as fine.
     """
     compiled = compile_run(problem, method, push=push)
-    fineness = []  # of the first solution, which the nudged one shares
+    fineness: list[int] = []  # of the first solution; the nudged one takes the same steps, so their errors cancel
 
-    def solve(scene, alone=False):
+    def solve(scene: Scene, alone: bool = False) -> tuple[PyTree, PyTree, PyTree, str]:
         runs, count, started = [], FIRST_STEPS_PER_FRAME, time.process_time()
         if alone:
             runs.append(_run_compiled(compiled, scene, fineness[0]))
             return runs[0][0], None, None, ""
         while True:
             runs.append(_run_compiled(compiled, scene, count))
-            if len(runs) >= 3 and _has_converged(problem, scene, runs, wanted / 50):
+            if len(runs) >= 3 and _has_converged(problem, scene, runs, CONVERGED_ERROR_SHARE * wanted):
                 break
-            # the next takes twice as long as the last
+            # the next run takes twice as long as the last, hence as long again as all so far together
             if len(runs) >= 3 and 3 * (time.process_time() - started) > seconds:
                 break
             count = 2 * count + 1  # steps that never end where the coarser ones did
@@ -251,19 +257,22 @@ def _make_own_solver(
     return solve, lambda scene: _run_compiled(closer, scene, max(1, fineness[0] // 2))[0]
 
 
-def _run_compiled(compiled: CompiledRun, scene: Scene, count: int) -> Any:
+def _run_compiled(compiled: CompiledRun, scene: Scene, count: int) -> tuple[PyTree, PyTree]:
     found = jax.tree.map(np.asarray, compiled._replace(scene=scene)(count))
     return found if compiled.push is not None else (found, None)
 
 
-def _has_converged(problem: Problem, scene: Scene, runs: list, enough: float) -> bool:
+def _has_converged(problem: Problem, scene: Scene, runs: list[tuple[PyTree, PyTree]], enough: float) -> bool:
     last, before, first = (run[0] for run in (runs[-1], runs[-2], runs[-3]))
     changes = (path.error(scene, problem.times, other, last) for other in (before, first))
     return max(changes) < enough
 
 
-def _pick_worse(problem: Problem, scene: Scene, runs: list) -> Any:
-    """Of the two solutions before the last the one that tells of the larger error: what is answered late scatters."""
+def _pick_worse(problem: Problem, scene: Scene, runs: list[tuple[PyTree, PyTree]]) -> PyTree:
+    """Of the two solutions before the last the one that shows the larger error.
+
+    Where something is resolved at the end of a step the error scatters, and the last refinement may show little by chance.
+    """
     last, before, first = (run[0] for run in (runs[-1], runs[-2], runs[-3]))
     if not problem.scene.resolves_at_step_end:
         return before

@@ -4,28 +4,39 @@ import csv
 import math
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from physjax.files import write_atomically
-from physjax.show.style import PROJECTED_SUFFIX
+from physjax.show.style import AS_GIVEN, PROJECTED
 from physjax.text import format_seconds, format_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TABLE_ERRORS = (1e-2, 1e-4, 1e-6)
 """Errors (relative to the extent of the path) for which the fastest method is named."""
 
 
 MAX_EXACT_FLOOR = 1e-10
-"""A truth whose own error is larger than this cannot say of a run that it is exact."""
+"""A truth whose own error is larger than this, in parts of the path, cannot say of a run that it is exact."""
+LARGEST_FITTED_ERROR = 0.05
+"""Error, in parts of the path, above which a run is too coarse to show its order."""
+FITTED_STEPS_RATIO = 8.0
+"""Steps up to this many times the finest are fitted: coarser ones still bend."""
+LEAST_SCATTERED_FALL = 10.0
+"""How far errors that scatter must fall over all steps for their slope to mean something."""
 
 
 class Run(NamedTuple):
     """One run of one method. Errors are relative to the extent of the path; `drifts` to the size of the conserved quantity.
 
-    `dt` [s] is None for what chooses its own steps, `tolerance` is None for fixed steps. `errors` are those in the norms
-    that were asked for. `seconds` is the least and
-    `seconds_median` the median of several timings, compiling apart.
+    `method` is the name in tables and charts, such as "adaptive rk4, projected, float32"; what it is made of are fields of
+    their own: `scheme`, the method in the registry ("" where it is not known), or a rival; `treatment` of the contacts,
+    "as given" by the scene or "projected" at the end of the step; `dtype`; and `adaptive`, for what chooses its own steps.
+    `dt` [s] is None for these, `tolerance` is None for fixed steps. `errors` are those in the norms that were asked for.
+    `seconds` is the least and `seconds_median` the median of several timings, without compiling.
 
     Example:
         >>> chart = accuracy.work_precision(swing, [methods.verlet], [1 / 16, 1 / 32], duration=2.0, rivals=())
@@ -46,6 +57,9 @@ class Run(NamedTuple):
     drifts: tuple[float, ...]
     errors: tuple[float, ...] = ()
     dtype: str = "float64"
+    scheme: str = ""
+    treatment: str = AS_GIVEN
+    adaptive: bool = False
 
     @property
     def status(self) -> str:
@@ -58,9 +72,9 @@ class Run(NamedTuple):
 class WorkPrecision(NamedTuple):
     """All runs of a scene under its methods and rivals, their truth, and that truth's own error (`floor`).
 
-    `scattered`: touches are answered, or springs part, at the end of a step, under every method. `horizon` [s] is when
-    rounding has grown to a hundredth of the path; infinite without chaos. Times are those of `batch` copies, errors in
-    `gradients` those of the derivative by the start.
+    `promised` has the order of each method, by its name in tables. `scattered`: contacts are resolved, or springs break, at
+    the end of a step, under every method. `horizon` [s] is when rounding has grown to a hundredth of the path; infinite
+    without chaos. Times are those of `batch` copies, errors in `gradients` those of the derivative by the start.
 
     Example:
         >>> chart = accuracy.work_precision(swing, [methods.verlet], [1 / 16, 1 / 32], duration=2.0, rivals=())
@@ -85,7 +99,7 @@ class WorkPrecision(NamedTuple):
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """Names of the methods and rivals, in the order they ran."""
+        """Names of the methods and rivals in tables, in the order they ran."""
         return tuple(dict.fromkeys(run.method for run in self.runs))
 
     def of(self, method: str) -> tuple[Run, ...]:
@@ -95,20 +109,22 @@ class WorkPrecision(NamedTuple):
     def observed_order(self, method: str) -> float:
         """Slope of log error against log dt over the finest runs above rounding; inf if all is rounding, NaN if unknown.
 
-        Over all runs above rounding where contacts are projected or springs part: those errors scatter with where in a
-        step it happens to fall. The truth's own error counts as rounding, but tells of no run that it is exact.
+        Over all runs above rounding where contacts are projected or springs break: those errors scatter with where in a
+        step it happens to fall. The truth's own error counts as rounding, but no run is called exact by such a truth.
         """
         runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
-        resolved = [run for run in runs if self._rounding_error(run) < run.path_error < 0.05]
+        resolved = [run for run in runs if self._rounding_error(run) < run.path_error < LARGEST_FITTED_ERROR]
         if runs and all(run.path_error <= self._rounding_error(run) for run in runs):
             return float("inf") if self.floor <= MAX_EXACT_FLOOR else float("nan")
-        scattered = self.scattered or method.endswith(PROJECTED_SUFFIX)
-        finest = [run for run in resolved if run.dt < 8 * resolved[-1].dt or scattered]
-        errors = [run.path_error for run in finest]
-        # what scatters says nothing unless it falls by much
-        if len(finest) < 3 or (scattered and max(errors) < 10 * min(errors)):
+        if not resolved:
             return float("nan")
-        return float(np.polyfit(np.log([r.dt for r in finest]), np.log(errors), 1)[0])
+        scattered = self.scattered or resolved[-1].treatment == PROJECTED
+        finest = [run for run in resolved if run.dt < FITTED_STEPS_RATIO * resolved[-1].dt or scattered]
+        errors = [run.path_error for run in finest]
+        # errors that scatter show a slope only if they fall by much more than they scatter
+        if len(finest) < 3 or (scattered and max(errors) < LEAST_SCATTERED_FALL * min(errors)):
+            return float("nan")
+        return float(np.polyfit(np.log([run.dt for run in finest]), np.log(errors), 1)[0])
 
     def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
         """The run with the least time whose path error stays below `error`; None if none does."""
@@ -124,7 +140,7 @@ class WorkPrecision(NamedTuple):
         return tuple(front)
 
     def table(self) -> str:
-        """A line for each method: order promised and seen, its least time to each of `TABLE_ERRORS`, and where it failed."""
+        """A line for each method: order promised and observed, its least time to each of `TABLE_ERRORS`, and where it failed."""
         headers = ["method", "order", "seen", *(f"to {e:.0e}" for e in TABLE_ERRORS), "fails at dt", "compile"]
         rows = []
         for method in self.methods:
@@ -146,31 +162,24 @@ class WorkPrecision(NamedTuple):
     def to_csv(self, path: str | os.PathLike) -> None:
         """Write every run as one line of a CSV file; whole or absent."""
         fields = [name for name in Run._fields if name not in ("drifts", "errors")]
+        drifts = [f"drift of {name}" for name in self.conserved]
+        errors = [f"error of {name}" for name in self.norms]
         with write_atomically(path) as file:
             writer = csv.writer(file)
-            writer.writerow(
-                [
-                    "scene",
-                    *fields,
-                    *(f"drift of {name}" for name in self.conserved),
-                    *(f"error of {name}" for name in self.norms),
-                    "status",
-                    "truth",
-                    "floor",
-                ]
-            )
+            writer.writerow(["scene", *fields, *drifts, *errors, "status", "truth", "floor"])
             for run in self.runs:
-                numbers = [getattr(run, name) for name in fields]
+                values = run._asdict()
+                numbers = [values[name] for name in fields]
                 writer.writerow([self.name, *numbers, *run.drifts, *run.errors, run.status, self.truth, self.floor])
 
-    def plot(self, figure: Any = None) -> Any:
+    def plot(self, figure: "Figure | None" = None) -> "Figure":
         """Draw the study: the path, error against time, error against step, and drift or cost. Returns the matplotlib figure."""
         from physjax.study.accuracy.chart import draw_work_precision
 
         return draw_work_precision(self, figure)
 
     def _rounding_error(self, run: Run) -> float:
-        """Errors below this are rounding, or the truth's own."""
+        """Errors below this are rounding, which grows like a random walk over the steps, or the truth's own."""
         return max(10 * self.floor, 100 * float(np.finfo(run.dtype).eps) * math.sqrt(run.steps))
 
 

@@ -2,45 +2,90 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, PyTree
 
-from physjax.physics import contacts
+from physjax.particles import Particles
 from physjax.scene import Scene
-from physjax.show.style import FLOAT32_SUFFIX, PROJECTED_SUFFIX
-from physjax.stepping.adaptive import count_steps
+from physjax.show.style import AS_GIVEN, Variant
+from physjax.stepping.adaptive import Adaptive, count_steps
 from physjax.stepping.reference import solve_ode
+from physjax.study.accuracy.compiled_run import (
+    CompiledRun,
+    compile_run,
+    find_mapped_arrays,
+    map_copies,
+    stack_copies,
+)
 from physjax.study.accuracy.error_measures import ErrorMeasure, final, path
-from physjax.study.accuracy.method_facts import CompiledRun, compile_run, evaluations, smallest_size, stack_copies
+from physjax.study.accuracy.method_facts import count_evaluations, smallest_size, subdivided_method
+from physjax.study.accuracy.options import Budget
 from physjax.study.accuracy.reference_solution import ReferenceSolution
 from physjax.study.accuracy.result import Run
 from physjax.study.energy.quantities import Conserved
 from physjax.study.problem import Problem
+from physjax.timing import time_repeatedly
 from physjax.vectors import scale
 
+if TYPE_CHECKING:
+    import diffrax
 
-class Budget(NamedTuple):
-    """How long a study may take: refine a step until one run costs `seconds`, time each run `repeats` times.
+MAX_STEPS_PER_FRAME = 10**8
+"""Steps between two moments beyond which no budget reaches."""
+ROUNDING_ERRORS = {"float64": 1e-7, "float32": 1e-3}
+"""Errors below which refinements that bring nothing are put down to rounding, in parts of the path."""
+STALLED_ERROR_RATIO = 0.9
+"""A refinement that leaves more than this share of the error has brought nothing."""
+EVALUATIONS_PER_TRIED_STEP = 3
+"""Steps of the method inside an adaptive one for each that it tries: one whole and two halves."""
 
-    Example:
-        >>> accuracy.Budget(seconds=0.2)
-        Budget(seconds=0.2, repeats=5, refinement=1.5)
-    """
 
-    seconds: float = 0.05
-    repeats: int = 5
-    refinement: float = 1.5
+class Errors(TypedDict):
+    """Errors of a run, by the fields of `Run`."""
+
+    final_error: float
+    path_error: float
+    drifts: tuple[float, ...]
+    errors: tuple[float, ...]
+
+
+class Times(TypedDict):
+    """Times of a run, by the fields of `Run`."""
+
+    seconds: float
+    seconds_median: float
+
+
+class Effort(TypedDict):
+    """What a run took, by the fields of `Run`."""
+
+    dt: float | None
+    tolerance: float | None
+    steps: int
+    evaluations: int
+
+
+class Identity(TypedDict):
+    """Which method a run is of, by the fields of `Run`."""
+
+    method: str
+    scheme: str
+    treatment: str
+    adaptive: bool
+    dtype: str
 
 
 class Comparison(NamedTuple):
     """What all contenders meet: the problem, its true path at its moments, the norms, and how much time there is.
 
-    Times are those of `batch` copies at once, errors those of one. `dts` [s] and `tolerances` are given or None.
+    Times are those of `batch` copies at once, errors those of one. `dts` [s] are None where the budget chooses.
     """
 
     problem: Problem
@@ -51,68 +96,58 @@ class Comparison(NamedTuple):
     tolerances: Sequence[float]
     batch: int
 
-    def errors(self, scene: Scene, states: Any) -> dict[str, Any]:
-        """Errors of a run in the final state, on the path, in each of the norms, and what it lost of what is kept."""
-        judged = [norm.error(scene, self.truth.times, states, self.truth.states) for norm in (final, path, *self.norms)]
-        kept = self.problem.conserved
-        drifts = (
-            tuple(float(d) for d in _measure_drifts(scene, self._reference_times(scene), states, kept)) if kept else ()
+    def measure_errors(self, scene: Scene, states: PyTree) -> Errors:
+        """Errors of a run in the final state, on the path and in each of the norms, and the drift of what is conserved."""
+        at_end, on_path, *others = (
+            norm.error(scene, self.truth.times, states, self.truth.states) for norm in (final, path, *self.norms)
         )
-        return {"final_error": judged[0], "path_error": judged[1], "drifts": drifts, "errors": tuple(judged[2:])}
+        drifts = ()
+        if self.problem.conserved:
+            times = jnp.asarray(self.truth.times, scene.state.dtype)
+            drifts = tuple(float(d) for d in _measure_drifts(scene, times, states, self.problem.conserved))
+        return {"final_error": at_end, "path_error": on_path, "drifts": drifts, "errors": tuple(others)}
 
-    def _reference_times(self, scene: Scene) -> Any:
-        return jnp.asarray(self.truth.times, scene.state.dtype)
+    def measure_times(self, run: Callable[[], object]) -> Times:
+        """The least and the median time of a run [s]."""
+        # one that takes twice its budget is the last of its method: it need not be timed well
+        timing = time_repeatedly(run, self.budget.repeats, longest=2 * self.budget.seconds)[1]
+        return {"seconds": timing.least, "seconds_median": timing.median}
 
-    def times(self, name: str, run: Callable) -> dict[str, Any]:
-        """Times of a run: the least and the median [s]."""
-        seconds = time_run(run, self.budget)[1]
-        return {"method": name, "seconds": seconds[0], "seconds_median": seconds[1]}
-
-
-def list_treatments(scene: Scene) -> dict[str, Scene]:
-    """The scene, and where it times impacts also the scene that projects instead, by what is added to a method's name."""
-    if not any(contact.response is contacts.impact for contact in scene.contacts):
-        return {"": scene}
-    project = [
-        replace(contact, response=contacts.project, touching_since=None)
-        if contact.response is contacts.impact
-        else contact
-        for contact in scene.contacts
-    ]
-    return {
-        "": scene,
-        PROJECTED_SUFFIX: Scene(scene.state, scene.mass, scene.forces, project, scene.pinned, scene.emitter),
-    }
+    def is_fine_enough(self, runs: Sequence[Run]) -> bool:
+        """Whether the budget or rounding ends the refinement; steps that were given all run."""
+        return self.dts is None and (runs[-1].seconds > self.budget.seconds or _has_reached_rounding(runs))
 
 
-def run_method(comparison: Comparison, scene: Scene, method: Callable, suffix: str, dtype: Any) -> list[Run]:
-    """One method, from coarse to fine: one compilation, then runs until the budget or rounding ends the refinement."""
-    entry = compile_run(comparison.problem._replace(scene=scene), method, dtype)
-    many = entry if comparison.batch == 1 else _compile_copies(entry, comparison.batch)
-    name = entry.name + suffix + (FLOAT32_SUFFIX if np.dtype(dtype) == np.float32 else "")
-    runs = []
+def run_method(
+    comparison: Comparison, scene: Scene, method: Callable, treatment: str, dtype: DTypeLike
+) -> tuple[list[Run], float]:
+    """One method from coarse to fine, and the order that it promises: one compilation, then runs until it is fine enough."""
+    problem = comparison.problem._replace(scene=scene)
+    entry = compile_run(problem, method, dtype, treatment=treatment)
+    many = entry if comparison.batch == 1 else compile_run(problem, method, dtype, copies=comparison.batch)
+    runs: list[Run] = []
     for fineness in _list_finenesses(comparison, entry):
         states = entry(fineness)
         runs.append(
             Run(
-                **comparison.times(name, partial(many, fineness)),
-                **comparison.errors(entry.scene, states),
+                **_identify(entry.variant),
+                **comparison.measure_times(partial(many, fineness)),
+                **comparison.measure_errors(entry.scene, states),
                 **_count_effort(entry, fineness),
                 compile_seconds=entry.compile_seconds,
-                dtype=entry.dtype,
             )
         )
-        if comparison.dts is None and (runs[-1].seconds > comparison.budget.seconds or _is_at_rounding(runs)):
+        if comparison.is_fine_enough(runs):
             break
-    return runs
+    return runs, entry.promised
 
 
-def run_gradient(comparison: Comparison, scene: Scene, method: Callable, suffix: str, push: Any) -> list[Run]:
+def run_gradient(comparison: Comparison, scene: Scene, method: Callable, treatment: str, push: Particles) -> list[Run]:
     """The same for the derivative of the path along a push of the start, by forward mode, against the true derivative.
 
     The error is relative to the largest the true derivative becomes; the time is that of path and derivative together.
     """
-    entry = compile_run(comparison.problem._replace(scene=scene), method, push=push)
+    entry = compile_run(comparison.problem._replace(scene=scene), method, push=push, treatment=treatment)
     truth, runs = comparison.truth, []
     largest = float(np.abs(np.asarray(truth.slopes.place)).max())
     for fineness in _list_finenesses(comparison, entry):
@@ -120,47 +155,54 @@ def run_gradient(comparison: Comparison, scene: Scene, method: Callable, suffix:
         off = path.moments(truth.scene, truth.times, slopes, truth.slopes, largest)
         runs.append(
             Run(
-                **comparison.times(entry.name + suffix, partial(entry, fineness)),
+                **_identify(entry.variant),
+                **comparison.measure_times(partial(entry, fineness)),
                 **_count_effort(entry, fineness),
                 final_error=float(off[-1]),
                 path_error=float(off.max()),
                 drifts=(),
                 compile_seconds=entry.compile_seconds,
-                dtype=entry.dtype,
             )
         )
-        if comparison.dts is None and (runs[-1].seconds > comparison.budget.seconds or _is_at_rounding(runs)):
+        if comparison.is_fine_enough(runs):
             break
     return runs
 
 
-def run_rival(comparison: Comparison, scene: Scene, solver: Any) -> list[Run]:
+def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractAdaptiveSolver") -> list[Run]:
     """A diffrax solver with adaptive steps, from loose to tight tolerance; one compilation."""
     size = smallest_size(scene)
     times = jnp.asarray(comparison.truth.times, scene.state.dtype)
-    many = stack_copies(scene, comparison.batch) if comparison.batch > 1 else scene
-    arguments = lambda scene, tol: (scene, times, times[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
+    arguments = lambda tol: (times, times[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
     started = time.perf_counter()
-    compiled = solve_ode.lower(*arguments(scene, 1e-3)).compile()
+    compiled = solve_ode.lower(scene, *arguments(1e-3)).compile()
     compile_seconds = time.perf_counter() - started
+    timed = partial(compiled, scene)
+    if comparison.batch > 1:
+        timed = partial(_solve_copies, stack_copies(scene, comparison.batch), find_mapped_arrays(scene))
+    # first same as last: the last stage of a step is the first of the next
     stages = solver.tableau.num_stages - (1 if solver.tableau.fsal else 0)
-    runs = []
+    name, dtype = f"diffrax {type(solver).__name__}", np.dtype(scene.state.dtype).name
+    runs: list[Run] = []
     for tol in comparison.tolerances:
-        states, success, stats = compiled(*arguments(scene, tol))
-        run = partial(solve_ode if comparison.batch > 1 else compiled, *arguments(many, tol))
-        steps, measured = int(stats["num_steps"]), comparison.errors(scene, states)
+        states, success, stats = compiled(scene, *arguments(tol))
+        steps, measured = int(stats["num_steps"]), comparison.measure_errors(scene, states)
         if not success:
             measured |= {"final_error": float("nan"), "path_error": float("nan")}
         runs.append(
             Run(
-                **comparison.times(f"diffrax {type(solver).__name__}", run),
+                method=name,
+                scheme=name,
+                treatment=AS_GIVEN,
+                adaptive=True,
+                dtype=dtype,
+                **comparison.measure_times(partial(timed, *arguments(tol))),
                 **measured,
                 dt=None,
                 tolerance=tol,
                 steps=steps,
                 evaluations=stages * steps + 1,
                 compile_seconds=compile_seconds,
-                dtype=np.dtype(scene.state.dtype).name,
             )
         )
         if success and runs[-1].seconds > comparison.budget.seconds:
@@ -168,38 +210,46 @@ def run_rival(comparison: Comparison, scene: Scene, solver: Any) -> list[Run]:
     return runs
 
 
-def time_run(run: Callable, budget: Budget) -> tuple[Any, tuple[float, float]]:
-    """The result of a run, and the least and the median of its times [s]; the first counts only where it is long."""
-    times = []
-    for _ in range(budget.repeats + 1):
-        started = time.perf_counter()
-        result = jax.block_until_ready(run())
-        times.append(time.perf_counter() - started)
-        if times[-1] > 2 * budget.seconds:
-            break
-    times = times[1:] or times
-    return result, (min(times), float(np.median(times)))
+@eqx.filter_jit
+def _solve_copies(
+    scene: Scene,
+    copied: tuple[bool, ...] | None,
+    times: Array,
+    end: Array,
+    rtol: Array,
+    atol: Array,
+    solver: "diffrax.AbstractAdaptiveSolver",
+    strict: bool,
+) -> PyTree:
+    """States of stacked copies by a diffrax solver."""
+    return map_copies(lambda one: solve_ode(one, times, end, rtol, atol, solver, strict)[0], scene, copied)
 
 
-def _compile_copies(entry: CompiledRun, count: int) -> CompiledRun:
-    """The method compiled for so many copies of the scene."""
-    problem = entry.problem._replace(scene=stack_copies(entry.scene, count))
-    return compile_run(problem, entry.method, entry.dtype)
+def _identify(variant: Variant) -> Identity:
+    """The fields of a run that say of which variant of a method it is."""
+    return {
+        "method": variant.display_name,
+        "scheme": variant.method,
+        "treatment": variant.treatment,
+        "adaptive": variant.adaptive,
+        "dtype": variant.dtype,
+    }
 
 
-def _count_effort(entry: CompiledRun, fineness: float) -> dict[str, Any]:
+def _count_effort(entry: CompiledRun, fineness: float) -> Effort:
     """Step or tolerance of a run, its steps and evaluations; counted, where a method chooses its own steps."""
-    frames = entry.problem.frames
-    if not entry.adaptive:
+    frames, method = entry.problem.frames, entry.tune_method(fineness)
+    if not isinstance(method, Adaptive):
         steps = frames * entry.count(fineness)
-        each = evaluations(entry.method, entry.scene)
+        each = count_evaluations(method, entry.scene)
         return {"dt": entry.dt(fineness), "tolerance": None, "steps": steps, "evaluations": each * steps}
-    measured = count_steps(entry.scene, entry.tune_method(fineness), dt=entry.dt(fineness), steps=frames)
+    measured = count_steps(entry.scene, method, dt=entry.dt(fineness), steps=frames)
+    # lanes run in step: the slowest lane of each dt sets the count
     tries = np.asarray(measured.accepted + measured.rejected).reshape(frames, -1).max(axis=1).sum()
-    each = 3 * evaluations(getattr(entry.method.method, "function", entry.method.method), entry.scene)
-    # whole and in halves, and two to begin each dt with
-    counts = {"steps": int(tries), "evaluations": int(each * tries + 2 * frames)}
-    return {"dt": None, "tolerance": 1 / fineness} | counts
+    each = EVALUATIONS_PER_TRIED_STEP * count_evaluations(subdivided_method(method), entry.scene)
+    # and two for the length of the first step of each dt
+    evaluations = int(each * tries + 2 * frames)
+    return {"dt": None, "tolerance": 1 / fineness, "steps": int(tries), "evaluations": evaluations}
 
 
 def _list_finenesses(comparison: Comparison, entry: CompiledRun) -> list[float]:
@@ -210,18 +260,20 @@ def _list_finenesses(comparison: Comparison, entry: CompiledRun) -> list[float]:
         spacing = comparison.problem.duration / comparison.problem.frames
         return sorted({float(max(1, round(spacing / dt))) for dt in comparison.dts})
     counts = np.unique(np.round(comparison.budget.refinement ** np.arange(0, 60)).astype(int))
-    return [float(c) for c in counts if c < 10**8]
+    return [float(c) for c in counts if c < MAX_STEPS_PER_FRAME]
 
 
-def _is_at_rounding(runs: Sequence[Run]) -> bool:
+def _has_reached_rounding(runs: Sequence[Run]) -> bool:
     """Whether the last two refinements no longer reduced the error: rounding has taken over."""
-    errors = [run.path_error for run in runs[-3:]]
-    close = 1e-7 if runs[-1].dtype == "float64" else 1e-3
-    return len(errors) == 3 and max(errors) < close and errors[1] > 0.9 * errors[0] and errors[2] > 0.9 * errors[1]
+    if len(runs) < 3:
+        return False
+    first, second, third = (run.path_error for run in runs[-3:])
+    small = max(first, second, third) < ROUNDING_ERRORS.get(runs[-1].dtype, ROUNDING_ERRORS["float32"])
+    return small and second > STALLED_ERROR_RATIO * first and third > STALLED_ERROR_RATIO * second
 
 
 @partial(jax.jit, static_argnames="quantities")
-def _measure_drifts(scene: Scene, times: Any, states: Any, quantities: tuple[Conserved, ...]) -> list:
+def _measure_drifts(scene: Scene, times: Array, states: PyTree, quantities: tuple[Conserved, ...]) -> list[Array]:
     """Largest change of each conserved quantity over the path, relative to its size."""
     over_time = lambda f: jax.vmap(lambda t, state: f(scene, t, state))(times, states)  # noqa: E731
     drifts = []

@@ -2,46 +2,58 @@
 
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
+from physjax.particles import Particles
+from physjax.study.accuracy.compiled_run import CompiledRun
 from physjax.study.accuracy.error_measures import ErrorMeasure, path
-from physjax.study.accuracy.method_facts import CompiledRun
 from physjax.study.accuracy.reference_solution import ReferenceSolution
 from physjax.study.problem import Problem
+from physjax.timing import time_in_turn, time_repeatedly
 
 STEPS_FACTOR, TOLERANCE_FACTOR = 2.0, 10.0
-"""From one exploring run to the next: so many times the steps, so many times less tolerance."""
-MIN_TIMED_SECONDS, MAX_RUN_SECONDS = 20e-3, 2.0
-"""Runs are timed again up to this [s] together, since clocks and neighbours blur short ones; one above ends an exploration."""
+"""From one exploring run to the next: this many times the steps, and the tolerance divided by this."""
+MIN_TIMED_SECONDS, MAX_TIMED_CALLS, MAX_RUN_SECONDS = 20e-3, 16, 2.0
+"""Calls of a run are timed up to this [s] together, or this many, since clocks and other work blur short ones; a run above
+the last [s] ends an exploration."""
 MAX_FINENESS = 1e12
 """Of tolerances; below is rounding."""
 CLOSE_STEP_RATIO = 1.15
 """A step within this factor of the longest that would do is as good."""
-MIN_TIMING_ROUNDS, MIN_TIMING_SECONDS = 7, 0.3
-"""Turns that finalists take at least, and for how long [s]: what disturbs the machine comes in bursts."""
+TURN_SECONDS, MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS, MIN_TIMING_SECONDS = 1e-3, 7, 1000, 0.3
+"""Finalists take turns of this length [s], at least so many rounds and so long [s]: what disturbs the machine comes in bursts."""
 GRACE_SECONDS = 5.0
-"""Beyond the deadline nothing is compiled; short runs may still settle an answer for so long [s]."""
+"""Beyond the deadline nothing is compiled; short runs may still decide between finalists for this long [s]."""
+ROUNDING_ERROR, COARSE_ERROR = 1e-13, 0.3
+"""Between these errors, in parts of the path, two runs show with which power of fineness errors fall."""
+ERROR_MARGIN, INTERPOLATED_ERROR_MARGIN = 0.9, 0.93
+"""Shares of an error aimed at, so that the first guess keeps it: beyond the runs known, and between two of them."""
+MAX_REFINEMENTS = 6
+"""Runs in which the longest step that keeps an error is closed in on."""
 
 
 class SearchTask(NamedTuple):
-    """What is asked of a run, and until when (`time.process_time`) there is time to answer it."""
+    """What is asked of a run, and the deadline (`time.process_time`) of the search."""
 
     problem: Problem
     truth: ReferenceSolution
     norm: ErrorMeasure
-    scale: Any
-    push: Any
+    scale: ArrayLike | None
+    push: Particles | None
     deadline: float
 
     def time_left(self) -> float:
         """Processor time left [s]."""
         return self.deadline - time.process_time()
 
-    def error(self, found: Any) -> float:
-        """The error of a run; of what becomes of the push as well, if there is one."""
+    def error(self, found: PyTree) -> float:
+        """The error of a run; of the derivative along the push as well, if there is one."""
         if self.push is None:
             return self._finite_error(self.norm, found, self.truth.states, self.scale)
         states, slopes = found
@@ -51,13 +63,13 @@ class SearchTask(NamedTuple):
             self._finite_error(path, slopes, self.truth.slopes, largest),
         )
 
-    def _finite_error(self, norm: ErrorMeasure, states: Any, truth: Any, scale: Any) -> float:
+    def _finite_error(self, norm: ErrorMeasure, states: PyTree, truth: PyTree, scale: ArrayLike | None) -> float:
         error = norm.error(self.truth.scene, self.truth.times, states, truth, self.truth.size(norm, scale))
         return error if np.isfinite(error) else float("inf")
 
 
 class Trial(NamedTuple):
-    """One run: how fine, its error, and what it took [s]."""
+    """One run: its fineness, its error, and the time it took [s]."""
 
     fineness: float
     error: float
@@ -72,61 +84,63 @@ class Exploration(NamedTuple):
 
     @property
     def slope(self) -> float:
-        """The power of fineness with which errors fall, as seen in the last two runs that are far from rounding."""
+        """The power of fineness with which errors fall, as observed in the last two runs that are far from rounding."""
         order = self.compiled_run.promised if np.isfinite(self.compiled_run.promised) else 1.0
+        # the error of a step of order p goes as dt^(p+1): a tolerance on it leaves a global error of its p/(p+1)th power
         promised = order / (order + 1) if self.compiled_run.adaptive else order
-        good = [t for t in self.trials if 1e-13 < t.error < 0.3]
+        good = [t for t in self.trials if ROUNDING_ERROR < t.error < COARSE_ERROR]
         if len(good) < 2 or good[-1].error >= good[-2].error:
             return promised
         a, b = good[-2:]
-        seen = float(np.log(a.error / b.error) / np.log(b.fineness / a.fineness))
-        return min(max(seen, 0.5 * promised), 1.5 * promised)
+        observed = float(np.log(a.error / b.error) / np.log(b.fineness / a.fineness))
+        return min(max(observed, 0.5 * promised), 1.5 * promised)
 
     def fineness(self, goal: float) -> float:
-        """How fine it must be for an error, by its runs: between two of them, or beyond the last by their slope."""
+        """The fineness for an error, from the runs: between two of them, or beyond the last by their slope."""
         good = [t for t in self.trials if t.error <= goal]
         if not good:
             last = self.trials[-1]
-            return last.fineness * (last.error / (0.9 * goal)) ** (1 / self.slope) if last.error < 1 else np.inf
+            if not last.error < 1:
+                return np.inf
+            return last.fineness * (last.error / (ERROR_MARGIN * goal)) ** (1 / self.slope)
         best = min(good, key=lambda t: t.fineness)
         worse = [t for t in self.trials if t.fineness < best.fineness]
         if not worse:
             return best.fineness
         below = max(worse, key=lambda t: t.fineness)
+        # next to a run that failed, or far below the error, no power law holds: halve the gap
         if not below.error < 1 or best.error <= 1e-3 * goal:
             return float(np.sqrt(best.fineness * below.fineness))
-        share = np.log(below.error / (0.93 * goal)) / np.log(below.error / best.error)
+        share = np.log(below.error / (INTERPOLATED_ERROR_MARGIN * goal)) / np.log(below.error / best.error)
         wanted = below.fineness * (best.fineness / below.fineness) ** min(max(share, 0.1), 1.0)
         return float(wanted)
 
     def seconds(self, fineness: float) -> float:
-        """What a run takes [s], by the nearest run and how times grow with fineness."""
+        """The predicted time of a run [s], from the nearest run and how times grow with fineness."""
         if not np.isfinite(fineness):
             return np.inf
         nearest = min(self.trials, key=lambda t: abs(np.log(t.fineness / fineness)))
         order = self.compiled_run.promised if np.isfinite(self.compiled_run.promised) else 1.0
         power = 1 / (order + 1) if self.compiled_run.adaptive else 1.0
-        return nearest.seconds * (fineness / nearest.fineness) ** (
-            power if fineness > nearest.fineness else 0.5 * power
-        )
+        # towards coarser runs less is saved than steps are: every run has a part that does not depend on them
+        power = power if fineness > nearest.fineness else 0.5 * power
+        return nearest.seconds * (fineness / nearest.fineness) ** power
 
     @property
     def longest_stable_step(self) -> float:
-        """The longest step [s] that held, where longer ones were tried and did not; infinite if none failed."""
+        """The longest step [s] that stayed on the path, where longer ones did not; infinite if none failed."""
         failed = [t.fineness for t in self.trials if not t.error < 1]
-        held = [t.fineness for t in self.trials if t.error < 1 and t.fineness > max(failed, default=0.0)]
-        return self.compiled_run.dt(min(held)) if failed and held and not self.compiled_run.adaptive else float("inf")
+        good = [t.fineness for t in self.trials if t.error < 1 and t.fineness > max(failed, default=0.0)]
+        return self.compiled_run.dt(min(good)) if failed and good and not self.compiled_run.adaptive else float("inf")
 
 
 def run_trial(task: SearchTask, entry: CompiledRun, fineness: float) -> Trial:
     """Run a method once, and again where that was short."""
-    times = []
-    while not times or (len(times) < 16 and sum(times) < MIN_TIMED_SECONDS):
-        started = time.perf_counter()
-        found = jax.block_until_ready(entry(fineness))
-        times.append(time.perf_counter() - started)
+    found, timing = time_repeatedly(
+        partial(entry, fineness), MAX_TIMED_CALLS - 1, longest=MIN_TIMED_SECONDS, total=MIN_TIMED_SECONDS
+    )
     exactly = fineness if entry.adaptive else float(entry.count(fineness))
-    return Trial(exactly, task.error(jax.tree.map(np.asarray, found)), min(times))
+    return Trial(exactly, task.error(jax.tree.map(np.asarray, found)), timing.least)
 
 
 def explore_method(
@@ -141,13 +155,14 @@ def explore_method(
 
     A run that takes `longest` [s] is the last.
     """
-    factor, fineness, trials = (TOLERANCE_FACTOR, 10.0, []) if entry.adaptive else (STEPS_FACTOR, start, [])
+    trials: list[Trial] = []
+    factor, fineness = (TOLERANCE_FACTOR, 10.0) if entry.adaptive else (STEPS_FACTOR, start)
     while fineness <= MAX_FINENESS and (not trials or task.time_left() > -GRACE_SECONDS):
         trials.append(run_trial(task, entry, fineness))
         now = trials[-1]
         if now.error <= 0.5 * least or now.seconds > longest or _has_stalled(trials):
             break
-        # where steps follow the state, loose tolerances say nothing of tight ones
+        # adaptive steps follow the state: loose tolerances predict nothing about tight ones
         if not entry.adaptive and _is_outperformed(now, others):
             break
         fineness *= factor
@@ -155,7 +170,7 @@ def explore_method(
 
 
 def _has_stalled(trials: Sequence[Trial]) -> bool:
-    """Whether three more runs brought nothing: rounding, or a truth that is another one."""
+    """Whether three more runs brought nothing: rounding, or a run that converges to another path than the truth."""
     if len(trials) < 5 or not trials[-4].error < 0.5:
         return False
     return min(t.error for t in trials[-3:]) > 0.7 * trials[-4].error
@@ -169,9 +184,9 @@ def _is_outperformed(now: Trial, others: Sequence[Exploration]) -> bool:
 def refine_step(task: SearchTask, entry: Exploration, goal: float, most: float) -> tuple[Exploration, Trial | None]:
     """The longest step that keeps an error, verified: the runs with those made here, and that run; None if none keeps it.
 
-    `most` [s] is what a run may take to be of interest.
+    A run that takes more than `most` [s] is of no interest.
     """
-    for _ in range(6):
+    for _ in range(MAX_REFINEMENTS):
         good = [t for t in entry.trials if t.error <= goal]
         best = min(good, key=lambda t: t.fineness, default=None)
         guess = entry.fineness(goal)
@@ -180,38 +195,36 @@ def refine_step(task: SearchTask, entry: Exploration, goal: float, most: float) 
         if not np.isfinite(guess):
             return entry, None
         known = any(abs(np.log(t.fineness / guess)) < 1e-9 for t in entry.trials)
-        if best is not None and (
-            known or best.fineness / guess < CLOSE_STEP_RATIO or task.time_left() < -GRACE_SECONDS
-        ):
+        late = task.time_left() < -GRACE_SECONDS
+        if best is not None and (known or best.fineness / guess < CLOSE_STEP_RATIO or late):
             return entry, best
         if known:  # the guess itself failed, and nothing finer is known: a little finer
             guess *= CLOSE_STEP_RATIO
-        if entry.seconds(guess) > most or task.time_left() < -GRACE_SECONDS:
+        if entry.seconds(guess) > most or late:
             return entry, None
         trials = sorted((*entry.trials, run_trial(task, entry.compiled_run, guess)))
         entry = entry._replace(trials=tuple(trials))
     return entry, min((t for t in entry.trials if t.error <= goal), key=lambda t: t.fineness, default=None)
 
 
-def time_in_turn(finalists: Sequence[tuple[CompiledRun, Trial]]) -> list[float]:
-    """The least time of each finalist's run [s], all taking turns, so that whatever else the machine does meets all."""
-    least = [trial.seconds for _, trial in finalists]
-    begun, rounds = time.perf_counter(), 0
-    while finalists and (rounds < MIN_TIMING_ROUNDS or time.perf_counter() - begun < MIN_TIMING_SECONDS):
-        rounds += 1
-        for i, (entry, trial) in enumerate(finalists):
-            started = time.perf_counter()
-            jax.block_until_ready(entry(trial.fineness))
-            least[i] = min(least[i], time.perf_counter() - started)
-    return least
+def time_finalists(finalists: Sequence[tuple[CompiledRun, Trial]]) -> list[float]:
+    """The least time of each finalist's run [s], all taking turns; or that of its trial, where that was less."""
+    timings = time_in_turn(
+        [partial(entry, trial.fineness) for entry, trial in finalists],
+        slice_seconds=TURN_SECONDS,
+        seconds=MIN_TIMING_SECONDS,
+        rounds=(MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS),
+    )
+    return [min(trial.seconds, timing.least) for (_, trial), timing in zip(finalists, timings, strict=True)]
 
 
 def estimate_richardson_error(task: SearchTask, entry: CompiledRun, trial: Trial) -> float:
-    """Richardson's word on the error of a run: how much half the step (a tenth of the tolerance) changes it."""
+    """Richardson's estimate of a run's error: how much half the step (a tenth of the tolerance) changes it."""
     order = entry.promised if np.isfinite(entry.promised) else 1.0
     factor = TOLERANCE_FACTOR ** (1 + 1 / order) if entry.adaptive else STEPS_FACTOR
     here, finer = (jax.tree.map(np.asarray, entry(f)) for f in (trial.fineness, trial.fineness * factor))
     here, finer = ((found if task.push is None else found[0]) for found in (here, finer))
     size = task.truth.size(task.norm, task.scale)
     change = task.norm.error(task.truth.scene, task.truth.times, here, finer, size)
+    # of the error e the finer run still has e/2^p: what changed is the rest
     return change / (1 - 2.0**-order)

@@ -11,7 +11,7 @@ import pytest
 from physjax import Particles, Scene, accuracy, contacts, forces, methods
 from physjax.scenes import SCENES
 from physjax.study.accuracy import error_measures, recommend
-from physjax.study.accuracy.method_facts import compile_run
+from physjax.study.accuracy.compiled_run import compile_run
 from physjax.study.accuracy.reference_solution import solve_reference
 from physjax.study.problem import Problem
 
@@ -105,7 +105,7 @@ def test_touches_answered_late_are_what_stops_a_small_error():
         ball(contacts.project), error=1e-9, horizon=1.0, methods=[methods.verlet], seconds=3, progress=False
     )
     assert not advice.ok
-    assert "touches answered at the end of a step" in advice.reason
+    assert "contacts resolved at the end of a step" in advice.reason
     with pytest.raises(ValueError, match="nothing keeps an error"):
         advice.simulate()
 

@@ -15,7 +15,7 @@ from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import sample_states
 from physjax.study import accuracy
 from physjax.study.accuracy import Budget, work_precision
-from physjax.study.accuracy.method_facts import stack_copies
+from physjax.study.accuracy.compiled_run import compile_run, stack_copies
 from physjax.text import format_seconds
 
 FEW = Budget(seconds=0.02, repeats=1, refinement=2.0)
