@@ -1,7 +1,7 @@
 """The registry of methods, and what a method promises. Charts, tests and tables iterate it; nobody lists methods twice."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 METHODS: dict[str, Callable] = {}
 """Every method by name, in the order of their definition."""
@@ -49,3 +49,15 @@ def promises(
 def method_name(method: Callable) -> str:
     """What a method is called in tables."""
     return getattr(method, "__name__", None) or type(method).__name__
+
+
+@runtime_checkable
+class Promising(Protocol):
+    """A method that makes promises; a user's own function need not."""
+
+    promises: Promises
+
+
+def read_promises(method: Callable) -> Promises | None:
+    """What a method promises; None for one that promises nothing."""
+    return method.promises if isinstance(method, Promising) else None

@@ -1,13 +1,13 @@
-"""A scene that carries its own truth: how long to run it, what it must do, and how one knows."""
+"""A scene with its own truth: how long to run it, what must hold, and how that is known."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
-from physjax.particles import Particles
 from physjax.scene import Scene
 from physjax.stepping import methods
 from physjax.stepping.reference import cast_floats, reference
@@ -19,7 +19,9 @@ REFERENCE_STEPS_PER_FRAME = 64
 """Steps of rk4 between two moments at which errors are measured, where diffrax cannot be the reference."""
 
 FILM_FRAMES = 512
-"""A run is drawn from at least so many moments."""
+"""A run is drawn from at least this many moments."""
+REFERENCE_TOLERANCE = 1e-12
+"""Tolerance of diffrax's reference, relative and absolute: near the rounding of float64."""
 
 
 class Truth(NamedTuple):
@@ -39,16 +41,16 @@ class Problem(NamedTuple):
 
     `exact(times)` is the closed form, NumPy float64 with a leading axis of times; None where there is none. `conserved`
     are quantities that the physics keeps constant. `frames` is the number of equally spaced moments at which errors are
-    measured. `looks` is what it is drawn as, a lattice with faces or the shapes of bodies; without it the scene says.
+    measured. `looks` is what it is drawn as, a lattice with faces or the shapes of bodies; by default what the scene holds.
     """
 
     scene: Scene
     duration: float
-    exact: Callable[[np.ndarray], Particles] | None = None
+    exact: Callable[[np.ndarray], PyTree] | None = None
     conserved: tuple[Conserved, ...] = ()
     truths: tuple[Truth, ...] = ()
     frames: int = 32
-    looks: Any = None
+    looks: object = None
 
     @property
     def times(self) -> np.ndarray:
@@ -58,18 +60,17 @@ class Problem(NamedTuple):
     @property
     def is_ode(self) -> bool:
         """Whether the scene is an ordinary differential equation: no contacts, no emitter, and no force that remembers."""
-        jumps = self.scene.contacts or self.scene.emitter is not None
-        return not jumps and not any(hasattr(force, "advance") for force in self.scene.forces)
+        return not self.scene.contacts and self.scene.emitter is None and not self.scene.remembers
 
     def reference(self) -> Trajectory:
-        """The scene at `times`, in float64, as true as it can be had: NumPy arrays.
+        """The most accurate run of the scene at `times`, in float64: NumPy arrays.
 
         By diffrax at 1e-12. A scene that is no ordinary differential equation, with contacts or with springs that
-        break, is stepped by our own rk4 with `REFERENCE_STEPS_PER_FRAME` steps from each of the times to the next, touches answered as the
-        scene says. `parts` and `final_scene` then tell what is remembered.
+        break, is stepped by our own rk4 with `REFERENCE_STEPS_PER_FRAME` steps from each of the times to the next, contacts
+        resolved as the scene has it; `parts` and `final_scene` then hold what is remembered.
         """
         if self.is_ode:
-            return reference(self.scene, self.times, rtol=1e-12, atol=1e-12)
+            return reference(self.scene, self.times, rtol=REFERENCE_TOLERANCE, atol=REFERENCE_TOLERANCE)
         with jax.enable_x64(True):
             scene = cast_floats(self.scene, jnp.float64)
             steps = REFERENCE_STEPS_PER_FRAME * self.frames
@@ -79,11 +80,11 @@ class Problem(NamedTuple):
             return jax.tree.map(np.asarray, flight)
 
     def filmed(self) -> Trajectory:
-        """The reference at moments enough for a picture without corners, and a film."""
+        """The reference at enough moments for a smooth picture and a film."""
         return self._replace(frames=max(self.frames, FILM_FRAMES)).reference()
 
     def verify(self) -> list[tuple[Truth, np.ndarray, bool]]:
-        """Every truth with the measured value and whether it holds."""
+        """Every truth with its measured value and whether it holds."""
         flight = self.reference()
         with jax.enable_x64(True):
             measured = [np.asarray(truth.measure(flight)) for truth in self.truths]

@@ -5,16 +5,21 @@ import html
 import io
 from collections.abc import Sequence
 from datetime import date
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from physjax.text import describe_machine
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 PHONE_WIDTH_INCHES, READABLE_PIXELS_PER_INCH = 6.5, 65
-"""Width [inch] of a figure that still fits a phone; pixels an inch at which the letters of a wider one can be read."""
+"""Width [inch] of a figure that still fits a phone; pixels an inch at which the letters of a wider one are legible."""
+PIXELS_PER_INCH = 110
+"""Of encoded figures."""
 
 
 class Picture(NamedTuple):
-    """An encoded picture, what it shows in words, and the CSS pixels below which its letters cannot be read."""
+    """An encoded picture, what it shows in words, and the CSS pixels below which its letters are illegible."""
 
     data: bytes
     alt: str
@@ -29,18 +34,18 @@ class Table(NamedTuple):
 
 
 class Section:
-    """A part of a page: a heading, and what stands below it: sentences, `Picture`s and `Table`s in any order."""
+    """A part of a page: a heading, and below it sentences, `Picture`s and `Table`s in any order."""
 
     def __init__(self, heading: str, *blocks: str | Picture | Table):
         self.heading, self.blocks = heading, blocks
 
 
-def encode_figure(figure: Any, alt: str) -> Picture:
-    """A matplotlib figure as a picture, and closed; on a phone a wide one scrolls, so that it can be read."""
+def encode_figure(figure: "Figure", alt: str) -> Picture:
+    """A matplotlib figure as a picture; the figure is closed. On a phone a wide one scrolls, so that it stays legible."""
     from matplotlib import pyplot as plt
 
     file = io.BytesIO()
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=PIXELS_PER_INCH)
     plt.close(figure)
     inches = figure.get_figwidth()
     return Picture(file.getvalue(), alt, round(READABLE_PIXELS_PER_INCH * inches) if inches > PHONE_WIDTH_INCHES else 0)

@@ -1,7 +1,7 @@
-"""All that is told of a scene, part by part: picture, cost of accuracy, stability, ledger, ablation, recommendation."""
+"""The whole report on a scene, part by part: picture, cost of accuracy, stability, ledger, ablation, recommendation."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import jax
 import numpy as np
@@ -10,6 +10,7 @@ from physjax.particles import Particles
 from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import Scene, project
 from physjax.show import auto_plot
+from physjax.show.style import AS_GIVEN
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
@@ -21,15 +22,24 @@ from physjax.study.stability.survey import find_fastest_moment, map_around_limit
 from physjax.text import format_seconds
 
 TARGET_ERROR = 1e-4
-"""Error, relative to the extent of the path, of the run whose books are closed and whose parts are left out."""
+"""Error, relative to the extent of the path, of the run whose energy is audited and whose parts are left out."""
 ABLATION_TIMING_SECONDS = 3.0
 """Time for the timings of the ablation [s]."""
 
 Block = str | Picture | Table
 
 
+class Stepping(TypedDict):
+    """Options of `simulate`."""
+
+    method: Callable
+    dt: float
+    duration: float
+    save_every: int
+
+
 class SceneStudy(NamedTuple):
-    """A scene under a name, what it is in one sentence, and its work-precision study, which the parts draw upon."""
+    """A scene, its name, what it is in one sentence, and its work-precision study, which the parts draw upon."""
 
     name: str
     sentence: str
@@ -38,22 +48,26 @@ class SceneStudy(NamedTuple):
 
     @property
     def run(self) -> Run | None:
-        """The cheapest run of our methods that is as true as wanted, or the truest; None if none stayed on the path.
+        """The cheapest run of our methods that is accurate enough, or the most accurate; None if none stayed on the path.
 
-        Of methods that follow an undamped swing as well: the ablation takes the damping away.
+        Only of methods that are stable on an undamped oscillator as well: the ablation leaves the damping out.
         """
-        steady = {name for name, method in METHODS.items() if method.promises.stability_limit > 0}
-        ours = [run for run in self.precision.runs if run.method in steady and run.status == "ok"]
-        true = [run for run in ours if run.path_error <= TARGET_ERROR]
-        return (
-            min(true, key=lambda run: run.seconds) if true else min(ours, key=lambda run: run.path_error, default=None)
-        )
+        stable = {name for name, method in METHODS.items() if method.promises.stability_limit > 0}
+        ours = [
+            run
+            for run in self.precision.runs
+            if run.scheme in stable and run.treatment == AS_GIVEN and not run.adaptive and run.status == "ok"
+        ]
+        accurate = [run for run in ours if run.path_error <= TARGET_ERROR]
+        if accurate:
+            return min(accurate, key=lambda run: run.seconds)
+        return min(ours, key=lambda run: run.path_error, default=None)
 
     @property
-    def stepping(self) -> dict[str, Any]:
+    def stepping(self) -> Stepping:
         """That run as options of `simulate`."""
         steps, problem = self.run.steps, self.problem
-        method, every = METHODS[self.run.method], steps // problem.frames
+        method, every = METHODS[self.run.scheme], steps // problem.frames
         return {"method": method, "dt": problem.duration / steps, "duration": problem.duration, "save_every": every}
 
     @property
@@ -71,7 +85,7 @@ def build_sections(
     budget: accuracy.Budget = accuracy.QUICK,
     progress: Callable[[str], None] = lambda what: None,
 ) -> Iterator[Section]:
-    """The `PARTS` of a scene's page, in the order of reading; what cannot be had for a scene says why in one sentence.
+    """The `PARTS` of a scene's page, in the order of reading; a part that a scene cannot have says why in one sentence.
 
     `sentence` says what the scene is. `progress(what)` is called before each part.
     """
@@ -117,16 +131,16 @@ def _chart_stability(studied: SceneStudy) -> Iterator[Block]:
     yield f"The longest stable step about t = {time:.3g} s, where the scene is fastest:"
     yield from map(str, limits)
     if stability.grows_by_itself(scene, at).any():
-        yield "Neighbours part there by the scene's own motion, whatever the method."
+        yield "Small deviations grow there by the scene's own motion, whatever the method."
     timed = any(contact.response is impact for contact in scene.contacts)
-    chart = map_around_limits(
-        Scene(scene.state, scene.mass, scene.forces, pinned=scene.pinned) if timed else scene, limits
-    )
+    # timed contacts compile for minutes, and the limit is that of the motion between them
+    free = Scene(scene.state, scene.mass, scene.forces, pinned=scene.pinned) if timed else scene
+    chart = map_around_limits(free, limits)
     if chart is None:
         yield "No map: no method has a limit here."
         return
     yield (
-        f"Runs from the start{', without their touches' if timed else ''}, judged by their error; the black line is the "
+        f"Runs from the start{', without their contacts' if timed else ''}, judged by their error; the black line is the "
         "limit predicted at their start."
     )
     yield encode_figure(
@@ -140,7 +154,7 @@ def _chart_ledger(studied: SceneStudy) -> Iterator[Block]:
         yield "No ledger: particles bring energy when they are born and take it when they die."
         return
     if any((contact.response or project) not in (*RESPONSE_OBSERVERS, project) for contact in scene.contacts):
-        yield "No ledger: a contact has a response of its own, and what it does to a touch is not known."
+        yield "No ledger: a contact has a response of its own, and how much energy that takes is not known."
         return
     if studied.run is None:
         yield NO_RUN
@@ -186,7 +200,7 @@ def _write_recommendation(studied: SceneStudy) -> Iterator[Block]:
     yield Table("\n\n".join(map(str, answers)))
 
 
-NO_RUN = "Not to be had: no run with a fixed step stayed on the path."
+NO_RUN = "Not available: no run with a fixed step stayed on the path."
 PARTS = {
     "scene": _show_scene,
     "speed against accuracy": _chart_precision,

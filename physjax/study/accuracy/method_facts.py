@@ -1,7 +1,7 @@
 """What a method promises for a scene, what a step of it costs, and the sizes by which its tolerances are set."""
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,19 +14,7 @@ from physjax.scene import Scene
 from physjax.show.style import Variant
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.reference import cast_floats
-from physjax.stepping.registry import Promises, method_name
-
-
-@runtime_checkable
-class Promising(Protocol):
-    """A method that makes promises; a user's own function need not."""
-
-    promises: Promises
-
-
-def read_promises(method: Callable) -> Promises | None:
-    """What a method promises; None for one that promises nothing."""
-    return method.promises if isinstance(method, Promising) else None
+from physjax.stepping.registry import method_name, read_promises
 
 
 def describe_method(method: Callable) -> Variant:

@@ -16,9 +16,10 @@ from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.adaptive import adaptive
 from physjax.stepping.methods import METHODS, rk4
+from physjax.stepping.registry import read_promises
 from physjax.study.accuracy.compiled_run import CompiledRun, compile_run, draw_random_push
 from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure, path
-from physjax.study.accuracy.method_facts import depends_on_velocity, method_title, promised_order, read_promises
+from physjax.study.accuracy.method_facts import depends_on_velocity, method_title, promised_order
 from physjax.study.accuracy.options import SearchOptions, merge_options
 from physjax.study.accuracy.reasons import (
     SAFE_ERROR_SHARE,

@@ -1,24 +1,34 @@
 """Stability drawn: the region of a method, and the map of a scene."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from physjax.show.style import style
+from physjax.study.stability.limits import Region
+from physjax.study.stability.map import INACCURATE_ERROR, StabilityMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 VERDICT_COLOURS = ("#CFE8D5", "#F6D98B", "#C9736A")
-"""Stable, inaccurate, diverged: told apart by their lightness as well."""
+"""Stable, inaccurate, diverged: distinguished by their lightness as well."""
+BOUNDARY_RADIUS = 1 + 1e-9
+"""The spectral radius at which the region is drawn to end: rounding must not hide that a method keeps the axis at 1."""
+LARGEST_LINEAR_RATIO = 20
+"""Parameters over a wider range than this ratio are drawn on a logarithmic axis."""
 
 
-def draw_region(result: Any, ax: Any = None) -> Any:
+def draw_region(result: Region, ax: "Axes | None" = None) -> "Axes":
     """Where a method is stable in the plane of λ dt; returns the axes."""
     from matplotlib import pyplot as plt
 
     if ax is None:
         ax = plt.figure(figsize=(5, 5), layout="constrained").add_subplot()
     x, y = result.z.real, result.z.imag
-    ax.contourf(x, y, result.radius, levels=[0, 1 + 1e-9], colors=[VERDICT_COLOURS[0]])
-    ax.contour(x, y, result.radius, levels=[1 + 1e-9], colors=[style(result.name)["color"]], linewidths=1.5)
+    ax.contourf(x, y, result.radius, levels=[0, BOUNDARY_RADIUS], colors=[VERDICT_COLOURS[0]])
+    ax.contour(x, y, result.radius, levels=[BOUNDARY_RADIUS], colors=[style(result.name)["color"]], linewidths=1.5)
     ax.axhline(0, color="0.7", linewidth=0.8)
     ax.axvline(0, color="0.7", linewidth=0.8)
     ax.set(xlabel="Re λ dt (damping)", ylabel="Im λ dt (ω dt)", title=f"{result.name}: stable inside")
@@ -26,7 +36,7 @@ def draw_region(result: Any, ax: Any = None) -> Any:
     return ax
 
 
-def draw_stability_map(result: Any, figure: Any = None) -> Any:
+def draw_stability_map(result: StabilityMap, figure: "Figure | None" = None) -> "Figure":
     """Verdicts over dt: a row for each method, or a panel for each where a parameter changes; returns the figure."""
     from matplotlib import pyplot as plt
 
@@ -44,19 +54,19 @@ def draw_stability_map(result: Any, figure: Any = None) -> Any:
             _draw_verdicts(ax, result.dts[i], result.values, result.verdict[i])
             ax.plot(result.predicted[i], result.values, color="black", linewidth=1.8, clip_on=True)
             ax.set(title=result.methods[i], ylabel=result.parameter)
-            if result.values.min() > 0 and result.values.max() > 20 * result.values.min():
+            if result.values.min() > 0 and result.values.max() > LARGEST_LINEAR_RATIO * result.values.min():
                 ax.set_yscale("log")
     else:
         _draw_strips(panels[0], result)
     handles = [plt.Rectangle((0, 0), 1, 1, color=c) for c in VERDICT_COLOURS] + [
         plt.Line2D([], [], color="black", linewidth=1.8)
     ]
-    words = ("stable, error < 5 % of the way", "inaccurate", "diverged", "predicted limit")
+    words = (f"stable, error < {100 * INACCURATE_ERROR:g} % of the way", "inaccurate", "diverged", "predicted limit")
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
-def _draw_verdicts(ax: Any, dts: np.ndarray, values: np.ndarray, verdict: np.ndarray) -> None:
+def _draw_verdicts(ax: "Axes", dts: np.ndarray, values: np.ndarray, verdict: np.ndarray) -> None:
     from matplotlib.colors import ListedColormap
 
     ax.set_xscale("log")
@@ -65,7 +75,7 @@ def _draw_verdicts(ax: Any, dts: np.ndarray, values: np.ndarray, verdict: np.nda
     ax.set(xlabel="dt [s]", xlim=(dts.min(), dts.max()))
 
 
-def _draw_strips(ax: Any, result: Any) -> None:
+def _draw_strips(ax: "Axes", result: StabilityMap) -> None:
     """A row for each method, the first on top."""
     places = np.arange(len(result.methods))
     _draw_verdicts(ax, result.dts[:, 0], places, result.verdict[:, 0])

@@ -1,7 +1,7 @@
-"""Why a run blew up, or went astray: the step it happened, what is responsible, and the two cheapest cures."""
+"""Why a run blew up, or went astray: the step at which it happened, what is responsible, and the two cheapest cures."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,34 +12,39 @@ from physjax.particles import Particles, demand_particles
 from physjax.scene import Scene
 from physjax.select import select_lane
 from physjax.stepping.adaptive import Adaptive
-from physjax.stepping.implicit import ImplicitEuler
-from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
-from physjax.study.stability.limits import Limit, growth, limit
+from physjax.study.stability.cures import list_cures, list_resolution_cures
+from physjax.study.stability.limits import growth, limit
 from physjax.study.stability.linearisation import rate_text
 from physjax.text import format_seconds
 from physjax.trajectory import Trajectory
 
 INSPECTED_FRAMES = 12
-"""Moments of a run at which its rates are looked at."""
-EVALUATIONS_PER_SOLVE = 20
-"""Evaluations that a linear solve is worth, when methods are compared: conjugate gradients take some dozens of products."""
+"""Moments of a run at which its rates are computed."""
 MAX_RESOLVED_RATE_STEP = 0.5
 """|λ| dt beyond which the fastest motion is stable at best, but not followed."""
+LIMIT_TOLERANCE = 1e-9
+"""Share by which dt may exceed a limit that was computed in rounded numbers."""
+LOST_STEP_SHARE = 0.01
+"""A step is lost in rounding where the last digit of a position is this share of the way gone in it."""
+LARGEST_GROWN_SIZE = 1e4
+"""A run that has grown to this many times its size is beyond its failure: what is found there says nothing of the cause."""
+ERROR_TOLERANCE_RATIO = 10
+"""An end this many times the tolerance away from a sound run's is elsewhere."""
 
 
 class Explanation(NamedTuple):
     """What went wrong. Printed, it is a few sentences.
 
     `cause` is "stiffness", "damping", "resolution" (a motion too fast for dt, though bounded), "rounding" (positions so
-    large that a step is lost in their last digits), "contact" (a surface that came over a lane waiting for its next
-    touch), "error measure" (an adaptive method that looks at velocities alone), "input" (a traced number beyond its
+    large that a step is lost in their last digits), "contact" (a surface that passed over a lane waiting for its next
+    contact), "error measure" (an adaptive method that measures velocities alone), "input" (a traced number beyond its
     bounds) or "nothing". `first_bad_step` (-1: the run stayed finite) and `node` say where; `limit` [s] is the step that
     was too long, at time `t` [s]; `growth` a small deviation's growth in one step.
 
     Example:
-        >>> told = stability.explain(swing, methods.verlet, dt=1.25)
-        >>> isinstance(told, stability.Explanation), told.cause, round(told.growth, 3)
+        >>> found = stability.explain(swing, methods.verlet, dt=1.25)
+        >>> isinstance(found, stability.Explanation), found.cause, round(found.growth, 3)
         (True, 'stiffness', 4.0)
     """
 
@@ -56,24 +61,31 @@ class Explanation(NamedTuple):
     cures: tuple[str, ...]
 
     def __str__(self) -> str:
+        return " ".join([self._describe_end(), self._describe_cause(), *(f"Cure: {cure}." for cure in self.cures)])
+
+    def _describe_end(self) -> str:
         ended = "The run stayed finite."
         if self.first_bad_step >= 0:
             node = f", node {', '.join(map(str, self.node))} first" if self.node else ""
             ended = f"Not finite after step {self.first_bad_step}{node}."
-        where = "" if self.spring is None else f" (the spring between nodes {self.spring[0]} and {self.spring[1]})"
-        why = {
+        return ended
+
+    def _describe_cause(self) -> str:
+        if self.cause in ("stiffness", "damping"):
+            where = "" if self.spring is None else f" (the spring between nodes {self.spring[0]} and {self.spring[1]})"
+            longest = format_seconds(self.limit) if self.limit else "0 (no step is stable)"
+            return (
+                f"dt = {format_seconds(self.dt)} is beyond {longest}, the limit set at t = {self.t:.4g} s by the {self.cause} "
+                f"of {self.force}{where}, λ = {rate_text(self.rate)} 1/s: deviations grow {self.growth:.6g} times a step."
+            )
+        return {
             "rounding": "Positions are so large that a step is lost in their rounding.",
-            "contact": "A surface came over a lane that had used up the eight touches of a step and waited for the next.",
+            "contact": "A surface passed over a lane that had used up the eight contacts of a step and waited for the next.",
             "error measure": "The error looks at velocities alone and cannot see that positions are wrong.",
             "input": "It starts non-finite: a traced number beyond its bounds, or a start on the wrong side of a contact.",
             "nothing": "Nothing was found wrong with the step.",
             "resolution": f"{self.force} moves things at |λ| = {abs(self.rate):.4g} 1/s at t = {self.t:.4g} s, too fast for dt.",
-        }.get(self.cause) or (
-            f"dt = {format_seconds(self.dt)} is beyond {format_seconds(self.limit) if self.limit else '0 (no step is stable)'}, "
-            f"the limit set at t = {self.t:.4g} s by the {self.cause} of {self.force}{where}, λ = {rate_text(self.rate)} 1/s: "
-            f"deviations grow {self.growth:.6g} times a step."
-        )
-        return " ".join([ended, why, *(f"Cure: {cure}." for cure in self.cures)])
+        }[self.cause]
 
 
 def explain(
@@ -84,20 +96,20 @@ def explain(
     steps: int = 1200,
     lane: int | tuple[int, ...] | None = None,
 ) -> Explanation:
-    """Why a run blew up or went astray: where, the force and the eigenvalue responsible, the limit broken, two cures.
+    """Why a run blew up or went astray: where, the force and the eigenvalue responsible, the limit exceeded, two cures.
 
     Give a trajectory, or a scene with a method and a dt [s], which is then run for `steps`. Print the result. Of many lanes
-    the first that failed is told, or the given `lane` alone (of coupled ones a scene), as if it were run by itself:
+    the first that failed is explained, or the given `lane` alone (of coupled ones a scene), as if it were run by itself:
     `explain(flight, lane=int(jnp.argmin(flight.ok)))`.
 
     Example:
-        >>> told = stability.explain(swing, methods.verlet, dt=1.25)
-        >>> told.cause, round(told.limit, 3), round(told.growth, 3)
+        >>> found = stability.explain(swing, methods.verlet, dt=1.25)
+        >>> found.cause, round(found.limit, 3), round(found.growth, 3)
         ('stiffness', 1.0, 4.0)
     """
     if isinstance(run, Trajectory) and run.scene is not None and not _starts_finite(run.scene, lane):
-        step, first = float(np.nanmin(np.asarray(run.dt))), int(run.first_step) + 1
-        return Explanation("input", "", None, 0j, 0.0, step, float("inf"), 1.0, first, (), (_INPUT_CURE,))
+        first = int(run.first_step) + 1
+        return _describe_sound_run(run, first, ())._replace(cause="input", cures=(_INPUT_CURE,))
     if lane is not None:
         return explain(_run_single_lane(run, method, dt, steps, lane))
     if isinstance(run, Scene):
@@ -107,47 +119,73 @@ def explain(
         steps = as_positive_integer("steps", steps) // every * every
         run = simulate(run, method, dt=dt, steps=steps, save_every=every)
     if not isinstance(run, Trajectory) or run.scene is None or run.stepper is None or run.state is None:
-        raise TypeError(
-            "explain: expected a Trajectory that knows its scene and method, or a Scene with method and dt."
-        )
+        raise TypeError(_INCOMPLETE_RUN)
     demand_particles("explain", run.scene.state, "what turns is not linearised")
-    scene, method, step = run.scene, run.method, float(np.min(np.asarray(run.dt)))
-    as_real_quantity("dt [s]", step, above=0.0)
-    first, node = _find_first_failure(run)
-    result = {"dt": step, "first_bad_step": first, "node": node}
-    plain = Explanation("nothing", "", None, 0j, 0.0, step, float("inf"), 1.0, first, node, ())
-    if isinstance(method, Adaptive):
-        return _check_error_measure(run, method, plain)
-    if _fails_in_contact(run, first):
-        return plain._replace(cause="contact", cures=("a shorter dt, of no more than eight touches a step",))
-    if _is_step_below_rounding(scene, step):
-        return plain._replace(cause="rounding", cures=("compute in float64", "put the origin near the scene"))
-    moments = list(_pick_moments(run, scene))
-    found = [(t, limit(scene, method, at=state), state) for t, state in moments]
-    broken = [moment for moment in found if step > moment[1].dt * (1 + 1e-9)]
-    if broken:
-        t, worst, state = broken[0]  # what follows may be its consequence
-        grown = float(np.max(growth(scene, method, step, at=state)))
-        return Explanation(
-            worst.cause, worst.force, worst.spring, worst.rate, t, limit=worst.dt, growth=grown, **result,
-            cures=_list_cures(scene, method, step, worst, state),
-        )  # fmt: skip
-    t, fastest, _ = max(found, key=lambda moment: abs(moment[1].rate))
-    if abs(fastest.rate) * step > MAX_RESOLVED_RATE_STEP:
-        finer = 0.1 / abs(fastest.rate)
-        cures = (
-            f"dt = {format_seconds(finer)}, {step / finer:.3g} times the cost",
-            "methods.adaptive, short steps where it is fast",
-        )
-        return plain._replace(
-            cause="resolution", force=fastest.force, rate=fastest.rate, t=t, limit=fastest.dt, cures=cures
-        )
-    return plain
+    return _explain_run(run)
 
 
+_INCOMPLETE_RUN = "explain: expected a Trajectory that knows its scene and method, or a Scene with method and dt."
 _INPUT_CURE = (
     "build the scene with its numbers outside jit, vmap and sweep, where the error names the one that is wrong"
 )
+
+
+def _explain_run(run: Trajectory) -> Explanation:
+    """The first cause that fits, in an order in which none hides behind the consequences of another."""
+    scene, method, step = run.scene, run.method, float(np.min(np.asarray(run.dt)))
+    as_real_quantity("dt [s]", step, above=0.0)
+    first, node = _find_first_failure(run)
+    sound = _describe_sound_run(run, first, node)
+    if isinstance(method, Adaptive):
+        return _check_error_measure(run, method, sound)
+    if _fails_in_contact(run, first):
+        return sound._replace(cause="contact", cures=("a shorter dt, of no more than eight contacts a step",))
+    if _is_step_below_rounding(scene, step):
+        return sound._replace(cause="rounding", cures=("compute in float64", "put the origin near the scene"))
+    return _check_rates(run, sound)
+
+
+def _describe_sound_run(run: Trajectory, first: int, node: tuple[int, ...]) -> Explanation:
+    """The explanation of a run with whose step nothing is wrong."""
+    return Explanation(
+        cause="nothing",
+        force="",
+        spring=None,
+        rate=0j,
+        t=0.0,
+        dt=float(np.nanmin(np.asarray(run.dt))),
+        limit=float("inf"),
+        growth=1.0,
+        first_bad_step=first,
+        node=node,
+        cures=(),
+    )
+
+
+def _check_rates(run: Trajectory, sound: Explanation) -> Explanation:
+    """Whether the step exceeds a limit at a moment of the run, or is too long to follow the fastest motion."""
+    scene, method, step = run.scene, run.method, sound.dt
+    found = [(t, limit(scene, method, at=state), state) for t, state in _pick_moments(run, scene)]
+    exceeded = [moment for moment in found if step > moment[1].dt * (1 + LIMIT_TOLERANCE)]
+    if exceeded:
+        t, worst, state = exceeded[0]  # what follows may be its consequence
+        return sound._replace(
+            cause=worst.cause,
+            force=worst.force,
+            spring=worst.spring,
+            rate=worst.rate,
+            t=t,
+            limit=worst.dt,
+            growth=float(np.max(growth(scene, method, step, at=state))),
+            cures=list_cures(scene, method, step, worst, state),
+        )
+    t, fastest, _ = max(found, key=lambda moment: abs(moment[1].rate))
+    if abs(fastest.rate) * step <= MAX_RESOLVED_RATE_STEP:
+        return sound
+    cures = list_resolution_cures(step, fastest)
+    return sound._replace(
+        cause="resolution", force=fastest.force, rate=fastest.rate, t=t, limit=fastest.dt, cures=cures
+    )
 
 
 def _starts_finite(scene: Scene, lane: int | tuple[int, ...] | None) -> bool:
@@ -155,7 +193,7 @@ def _starts_finite(scene: Scene, lane: int | tuple[int, ...] | None) -> bool:
     finite = np.asarray(scene.finite(scene.state))
     index = () if lane is None else lane if isinstance(lane, tuple) else (lane,)
     known = len(index) <= finite.ndim and all(0 <= i < n for i, n in zip(index, finite.shape, strict=False))
-    return not known or bool(finite[index].all())  # an index that is none is told by what looks for the lane
+    return not known or bool(finite[index].all())  # a bad index is reported where the lane is selected
 
 
 def _run_single_lane(
@@ -167,9 +205,7 @@ def _run_single_lane(
         method, dt, steps, every, first_step = run.method, run.dt, run.steps, run.save_every, run.first_step
         run = run.scene
     if not isinstance(run, Scene) or method is None or dt is None:
-        raise TypeError(
-            "explain: expected a Trajectory that knows its scene and method, or a Scene with method and dt."
-        )
+        raise TypeError(_INCOMPLETE_RUN)
     step = np.asarray(dt)[lane] if np.ndim(dt) else dt
     scene = select_lane(run, lane)
     return simulate(scene, method, dt=step, steps=steps // every * every, save_every=every, first_step=first_step)
@@ -190,7 +226,7 @@ def _find_first_failure(run: Trajectory) -> tuple[int, tuple[int, ...]]:
 
 
 def _fails_in_contact(run: Trajectory, first: int) -> bool:
-    """Whether the step that was the first bad one is finite if nothing is in the way."""
+    """Whether the first bad step is finite without the contacts."""
     if first < 0 or not run.scene.contacts:
         return False
     before, scene = first - int(run.first_step) - 1, run.scene
@@ -201,55 +237,37 @@ def _fails_in_contact(run: Trajectory, first: int) -> bool:
     return bool(jnp.all(scene.finite(after.state)))
 
 
-def _record_state(t: Any, state: Particles) -> Particles:
+def _record_state(t: ArrayLike, state: Particles) -> Particles:
     return state
 
 
 def _is_step_below_rounding(scene: Scene, dt: float) -> bool:
-    """Whether a hundredth of a step is lost in the last digit of a position."""
+    """Whether a hundredth of the way gone in a step is lost in the last digit of a position."""
     x, v = (np.abs(np.asarray(leaf, float)) for leaf in scene.state)
     spacing = float(jnp.finfo(scene.state.dtype).eps) * x
     moving = v > 0
-    return bool(np.any(moving & (spacing > 0.01 * v * dt)))
+    return bool(np.any(moving & (spacing > LOST_STEP_SHARE * v * dt)))
 
 
-def _pick_moments(run: Trajectory, scene: Scene) -> Any:
-    """Start, and some finite frames of a run that went no further than ten thousand times its size."""
-    size = 1e4 * max(float(np.abs(np.asarray(scene.state.position)).max()), 1.0)
+def _pick_moments(run: Trajectory, scene: Scene) -> Iterator[tuple[float, Particles]]:
+    """The start, and some finite frames of a run up to ten thousand times its size: time [s] and state."""
+    size = LARGEST_GROWN_SIZE * max(float(np.abs(np.asarray(scene.state.position)).max()), 1.0)
     for i in np.unique(np.linspace(0, len(run.time) - 1, INSPECTED_FRAMES).astype(int)):
         state = Particles(*(leaf[i] for leaf in run.state))
         if all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in state) and float(jnp.max(jnp.abs(state.position))) < size:
             yield float(np.min(np.asarray(run.time[i]))), state
 
 
-def _list_cures(scene: Scene, method: Any, dt: float, worst: Limit, state: Particles) -> tuple[str, ...]:
-    """A shorter step of the same method, and the method that needs the fewest evaluations."""
-    cures = []
-    promised = getattr(method, "promises", None)
-    if worst.dt > 0:
-        cures.append(f"dt = {format_seconds(0.9 * worst.dt)}, {dt / (0.9 * worst.dt):.3g} times the cost")
-    others = []
-    for name, other in METHODS.items():
-        longest = min(0.9 * limit(scene, other, at=state).dt, dt) if other is not method else 0.0
-        if longest > 0:
-            solves = isinstance(other, ImplicitEuler)
-            others.append(
-                ((EVALUATIONS_PER_SOLVE if solves else other.promises.evaluations) / longest, longest, name, solves)
-            )
-    for cost, longest, name, solves in sorted(others)[: 2 - len(cures)]:
-        times = f", {cost * dt / promised.evaluations:.3g} times the cost" if promised else ""
-        cures.append(f"{name} with dt = {format_seconds(longest)}{', a linear solve a step' if solves else times}")
-    return tuple(cures)
-
-
-def _check_error_measure(run: Trajectory, method: Adaptive, plain: Explanation) -> Explanation:
-    """Whether an adaptive method that looks at velocities alone ends elsewhere than one that looks at all."""
+def _check_error_measure(run: Trajectory, method: Adaptive, sound: Explanation) -> Explanation:
+    """Whether an adaptive method that measures errors of velocities alone ends elsewhere than one that measures all."""
     if method.error != "velocity":
-        return plain
-    sound = Adaptive(method.method, method.atol, method.atol, method.dt_min, method.dt_max, method.order, "state", None)
-    flight = simulate(run.scene, sound, dt=run.dt, steps=run.steps, save_every=run.steps)
-    apart = np.abs(np.asarray(flight.position[-1]) - np.asarray(run.final_scene.state.position))
+        return sound
+    thorough = Adaptive(
+        method.method, method.atol, method.atol, method.dt_min, method.dt_max, method.order, "state", None
+    )
+    flight = simulate(run.scene, thorough, dt=run.dt, steps=run.steps, save_every=run.steps)
+    deviation = np.abs(np.asarray(flight.position[-1]) - np.asarray(run.final_scene.state.position))
     allowed = float(method.atol) * (1 + np.abs(np.asarray(flight.position[-1])))
-    if np.all(apart <= 10 * allowed):
-        return plain
-    return plain._replace(cause="error measure", cures=("adaptive(..., error='state')", "a method of higher order"))
+    if np.all(deviation <= ERROR_TOLERANCE_RATIO * allowed):
+        return sound
+    return sound._replace(cause="error measure", cures=("adaptive(..., error='state')", "a method of higher order"))

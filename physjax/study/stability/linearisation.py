@@ -2,18 +2,18 @@
 
 About a state, a deviation d (in coordinates √m δx, which make springs symmetric) moves as d̈ = -K d - C ḋ. A method
 that steps the whole state along its rate sees nothing but the eigenvalues λ of that; one that kicks and drifts sees K
-and C themselves. Contacts are left out: they act at touches, not in between.
+and C themselves. Contacts are left out: they act at impacts, not in between.
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Complex, Float
 
 from physjax.particles import Particles, demand_particles
 from physjax.parts import Force
@@ -27,16 +27,20 @@ KRYLOV_VECTORS = 60
 
 
 DRIFT_RATE_SHARE = 1e-6
-"""Modes slower than this fraction of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
+"""Modes slower than this share of the fastest are drifts (a body free to move as a whole): they grow with time, not dt."""
 ROUNDING_RATE_SHARE = 1e-9
-"""The real part, in parts of the fastest rate, that is none."""
+"""A real part below this share of the fastest rate is rounding."""
+INDEPENDENT_SHARE = 1e-10
+"""A vector of which the basis leaves less than this share is in its span."""
+COMMUTATOR_TOLERANCE = 1e-12
+"""Rounding of the commutator of two matrices of order 1."""
 
 
 class SmallMotion(NamedTuple):
     """Stiffness K [1/s²] and damping C [1/s] in coordinates √m δx, `(*blocks, n, n)`: a block for each entry of a status.
 
-    `basis` `(*blocks, n, coordinates)` holds in its rows what the n coordinates are; None where they are the lanes'
-    components one after the other.
+    The rows of `basis` `(*blocks, n, coordinates)` are the n coordinates; None where they are the lanes' components one
+    after the other.
     """
 
     stiffness: np.ndarray
@@ -52,13 +56,13 @@ class SmallMotion(NamedTuple):
         return np.linalg.eig(self._rate_matrix()[block])
 
     def growth_projector(self, partners: bool = False) -> np.ndarray | None:
-        """What a motion has of those that grow by themselves, as matrices on (d, ḋ), `(*blocks, 2n, 2n)`; None without.
+        """Projectors on the modes that grow by themselves, as matrices on (d, ḋ), `(*blocks, 2n, 2n)`; None without any.
 
-        Growth is e^(λt) however slow, but for drifts. The matrices are projections along all the other modes, so that
-        without that part a motion goes on as if none of it grew. With `partners` they take what decays as fast as
-        another grows as well: the same displacements, without damping.
+        Growth is e^(λt) however slow, drifts excepted. They project along all the other modes, so that a motion without
+        that part goes on as if none of it grew. With `partners` modes that decay as fast as another grows are included:
+        without damping they have the same displacements.
         """
-        # in units in which both halves of the fastest motion are as large
+        # in units in which displacements and velocities of the fastest motion are of one size: well conditioned
         fastest = self.fastest_rate()
         fastest_rate = np.where(fastest > 0, fastest, 1.0)
         unit = np.concatenate(
@@ -75,12 +79,12 @@ class SmallMotion(NamedTuple):
             if not grows.any():
                 continue
             same, left = np.linalg.eig(scaled[block].T)
-            # of a matrix and its transpose the same eigenvalues, the nearest to each
+            # a matrix and its transpose have the same eigenvalues, in another order: match each with the nearest
             matched = []
             for number in λ[grows]:
-                apart = np.abs(same - number)
-                apart[matched] = np.inf
-                matched.append(int(np.argmin(apart)))
+                distance = np.abs(same - number)
+                distance[matched] = np.inf
+                matched.append(int(np.argmin(distance)))
             right, left = right[:, grows], left[:, matched]
             found[block] = (right @ np.linalg.solve(left.T @ right, left.T)).real
         return found / unit[..., :, None] * unit[..., None, :] if found.any() else None
@@ -92,7 +96,7 @@ class SmallMotion(NamedTuple):
     def displacement(self, block: tuple[int, ...], mode: np.ndarray) -> np.ndarray:
         """The positions of a mode of a block, `(coordinates,)` complex, of length 1."""
         n = self.stiffness.shape[-1]
-        # a mode that decays at once is seen in both halves, a drift in the velocities alone
+        # a drift has velocities alone; every other mode has displacements
         moved = mode[:n] if np.linalg.norm(mode[:n]) > 0 else mode[n:]
         moved = moved if self.basis is None else moved @ self.basis[block]
         return moved / np.linalg.norm(moved)
@@ -130,33 +134,36 @@ def linearise(scene: Scene, state: Particles) -> SmallMotion:
         stiffness, damping = _build_dense_matrices(scene, state, size)
         return SmallMotion(np.asarray(stiffness), np.asarray(damping), None)
 
-    def push(vector, which):
+    def apply(vector: np.ndarray, damping: bool) -> np.ndarray:
         pair = (vector, np.zeros_like(vector))
-        return np.asarray(_apply_stiffness_and_damping(scene, state, *map(jnp.asarray, pair[::-1] if which else pair)))
+        return np.asarray(
+            _apply_stiffness_and_damping(scene, state, *map(jnp.asarray, pair[::-1] if damping else pair))
+        )
 
+    # Krylov vectors K^i d and C^i d of a random d span the fastest modes of each; the rest is too slow to set a limit
     start = np.random.default_rng(0).normal(size=(*scene.status_shape, size))
     basis: list[np.ndarray] = []
-    for which in (0, 1):
+    for damping in (False, True):
         vector, fresh = start, True
         for _ in range(KRYLOV_VECTORS):
             vector, fresh = _orthonormalise(vector, basis)
             if not fresh:
                 break
             basis.append(vector)
-            vector = push(vector, which)
+            vector = apply(vector, damping)
     rows = np.stack(basis, axis=-2)
-    project = lambda which: rows @ np.stack([push(vector, which) for vector in basis], axis=-1)  # noqa: E731
-    return SmallMotion(project(0), project(1), rows)
+    project = lambda damping: rows @ np.stack([apply(vector, damping) for vector in basis], axis=-1)  # noqa: E731
+    return SmallMotion(project(False), project(True), rows)
 
 
 def _orthonormalise(vector: np.ndarray, basis: list[np.ndarray]) -> tuple[np.ndarray, bool]:
-    """The part of a vector that the basis lacks, of length 1, and whether there is any."""
+    """The part of a vector that is orthogonal to the basis, of length 1, and whether there is any."""
     before = np.linalg.norm(vector, axis=-1, keepdims=True)
-    for _ in range(2):  # the first pass leaves rounding errors of the size of what it takes away
+    for _ in range(2):  # the first pass leaves rounding errors of the size of what it removes
         for other in basis:
             vector = vector - np.sum(vector * other, axis=-1, keepdims=True) * other
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    return vector / np.where(length > 0, length, 1.0), bool(np.all(length > 1e-10 * before))
+    return vector / np.where(length > 0, length, 1.0), bool(np.all(length > INDEPENDENT_SHARE * before))
 
 
 @eqx.filter_jit
@@ -179,7 +186,7 @@ def _build_dense_matrices(scene: Scene, state: Particles, size: int) -> tuple[Ar
 
 
 def sqrt_mass(scene: Scene, state: Particles) -> Array:
-    """√m for each component of each lane: what makes a displacement a coordinate."""
+    """√m for each component of each lane: displacements times this are the coordinates."""
     return jnp.broadcast_to(jnp.sqrt(scene.mass)[..., None], state.position.shape)
 
 
@@ -202,44 +209,50 @@ class _LinearForce(Force):
 def step_matrices(method: Callable, stiffness: Array, damping: Array, dt: Array) -> Array:
     """The matrix of one step of a method on each block's small motion, `(blocks, 2n, 2n)`; `dt` is `(blocks,)`."""
 
-    def matrix(stiffness, damping, dt):
+    def build_matrix(stiffness: Array, damping: Array, dt: Array) -> Array:
         n = stiffness.shape[0]
         still = jnp.zeros((n, 1), stiffness.dtype)
         scene = Scene(Particles(still, still), forces=(_LinearForce(stiffness, damping),))
 
-        def column(y):
+        def step_column(y: Array) -> Array:
             after = method(scene, jnp.zeros((), y.dtype), Particles(y[:n, None], y[n:, None]), dt)
             return jnp.concatenate(after)[:, 0]
 
-        return jax.vmap(column, out_axes=1)(jnp.eye(2 * n, dtype=stiffness.dtype))
+        return jax.vmap(step_column, out_axes=1)(jnp.eye(2 * n, dtype=stiffness.dtype))
 
-    return jax.vmap(matrix)(stiffness, damping, dt)
+    return jax.vmap(build_matrix)(stiffness, damping, dt)
 
 
 @eqx.filter_jit
-def spectral_radius(method: Callable, z: Any) -> Array:
+def spectral_radius(method: Callable, z: Complex[Array, "..."]) -> Float[Array, "..."]:
     """Spectral radius of one step of a method at z = λ dt, on x″ = −|λ|²x + 2Re(λ)x′, for complex numbers of any shape."""
     flat = jnp.ravel(z)
     stiffness, damping = (jnp.abs(flat) ** 2)[:, None, None], (-2 * flat.real)[:, None, None]
     m = step_matrices(method, stiffness, damping, jnp.ones_like(flat.real))
     half, product = (m[:, 0, 0] + m[:, 1, 1]) / 2, m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
-    apart = half * half - product
-    real = jnp.abs(half) + jnp.sqrt(jnp.maximum(apart, 0.0))
-    return jnp.where(apart > 0, real, jnp.sqrt(jnp.maximum(product, 0.0))).reshape(z.shape)
+    # a real pair of eigenvalues, or a complex one, whose radius is the root of the determinant
+    discriminant = half * half - product
+    real = jnp.abs(half) + jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    return jnp.where(discriminant > 0, real, jnp.sqrt(jnp.maximum(product, 0.0))).reshape(z.shape)
 
 
 def follows_rates(method: Callable) -> bool:
-    """Whether a step is a function of the rate's matrix alone: it then commutes with it, whatever K and C are."""
+    """Whether a step is a function of the rate's matrix alone: it then commutes with it, whatever K and C are.
+
+    Tried on one pair of matrices that do not commute, which no other step passes by chance.
+    """
     stiffness, damping = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[0.3, -0.4], [-0.4, 1.5]])
     rate = SmallMotion(stiffness, damping, None)._rate_matrix()
     step = np.asarray(step_matrices(method, *map(jnp.asarray, (stiffness[None], damping[None])), jnp.full(1, 0.3)))[0]
-    return bool(np.abs(step @ rate - rate @ step).max() < 1e-12)
+    return bool(np.abs(step @ rate - rate @ step).max() < COMMUTATOR_TOLERANCE)
 
 
 def rate_text(rate: complex) -> str:
-    """A rate in few digits, as real, imaginary or the pair that it belongs to."""
-    if abs(rate.imag) < 1e-9 * abs(rate):
+    """A rate in few digits: real, imaginary or a conjugate pair."""
+    if abs(rate.imag) < ROUNDING_RATE_SHARE * abs(rate):
         return f"{rate.real:.4g}"
     return (
-        f"±{abs(rate.imag):.4g}i" if abs(rate.real) < 1e-9 * abs(rate) else f"{rate.real:.4g} ± {abs(rate.imag):.4g}i"
+        f"±{abs(rate.imag):.4g}i"
+        if abs(rate.real) < ROUNDING_RATE_SHARE * abs(rate)
+        else f"{rate.real:.4g} ± {abs(rate.imag):.4g}i"
     )

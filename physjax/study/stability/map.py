@@ -1,11 +1,12 @@
-"""Runs over many steps and scenes at once, judged stable, inaccurate or diverged, beside what was predicted."""
+"""Runs over many steps and scenes, classified as stable, inaccurate or diverged, next to the predicted limits."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from physjax.checks import as_real_quantity
 from physjax.parts import as_module
@@ -16,10 +17,19 @@ from physjax.stepping.registry import method_name
 from physjax.stepping.simulate import sample_states
 from physjax.study.stability.limits import check_method, limit
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 JUDGED_FRAMES = 4
-"""Moments at which a run is compared with the truth; every dt is rounded so that they are whole steps."""
+"""Moments at which a run is compared with the truth; every dt is rounded so that they fall on whole steps."""
+DEFAULT_STEPS_PER_FRAME = 10
+"""Of the longest step, between two of these moments, where no duration is given."""
 INACCURATE_ERROR, DIVERGED_ERROR = 0.05, 10.0
-"""Errors, in parts of the way that the scene goes, beyond which a run is called so."""
+"""Errors, relative to the way that the scene goes, beyond which a run is called so."""
+REST_SHARE = 1e-6
+"""A way shorter than this share of the scene's coordinates is rest; errors are then relative to the scene's size."""
+REFERENCE_STEPS_RATIO = 10
+"""Steps of the truth for each that is just stable: the fastest motion is then followed, not only bounded."""
 VERDICTS = ("stable", "inaccurate", "diverged")
 
 
@@ -43,7 +53,7 @@ class StabilityMap(NamedTuple):
     predicted: np.ndarray
     duration: float
 
-    def plot(self, figure: Any = None) -> Any:
+    def plot(self, figure: "Figure | None" = None) -> "Figure":
         """Draw the verdicts over dt with the predicted limits on top; returns the figure."""
         from physjax.study.stability.chart import draw_stability_map
 
@@ -53,16 +63,16 @@ class StabilityMap(NamedTuple):
 def map(
     scene: Scene | Callable[[float], Scene],
     methods: Sequence[Callable],
-    dts: Any,
-    parameter: tuple[str, Any] | None = None,
+    dts: ArrayLike | Sequence[float],
+    parameter: tuple[str, ArrayLike | Sequence[float]] | None = None,
     *,
     duration: float | None = None,
 ) -> StabilityMap:
-    """Run a scene under every method and dt [s], call each run stable, inaccurate or diverged, and predict the boundary.
+    """Run a scene under every method and dt [s], classify each run as stable, inaccurate or diverged, predict the boundary.
 
-    With a `parameter` (name, values), `scene` is a function of such a value. Judged by the positions after `duration`
-    [s] and on the way (forty of the longest steps, if not given): inaccurate is an error of more than 5 % of the way
-    gone, diverged one of more than ten times that way. Each dt is rounded to divide a quarter of the duration.
+    With a `parameter` (name, values), `scene` is a function of one value. Positions after `duration` [s] (by default forty
+    of the longest steps) and on the way decide: inaccurate is an error of more than 5 % of the distance travelled, diverged
+    one of more than ten times that distance. Each dt is rounded to divide a quarter of the duration.
 
     Example:
         >>> stability.map(swing, [methods.verlet], dts=[0.01, 1.25]).verdict.tolist()
@@ -77,23 +87,17 @@ def map(
         raise TypeError(
             "map: got a scene and a parameter that do not fit. Give a Scene, or a function and (name, values)."
         )
-    duration = float(
-        10 * JUDGED_FRAMES * dts[-1] if duration is None else as_real_quantity("duration [s]", duration, above=0.0)
-    )
+    if duration is None:
+        duration = DEFAULT_STEPS_PER_FRAME * JUDGED_FRAMES * dts[-1]
+    duration = float(as_real_quantity("duration [s]", duration, above=0.0))
     with jax.enable_x64(True):
         scenes = [cast_floats(scene(value) if parameter else scene, jnp.float64) for value in values]
         predicted = np.array([[limit(s, method).dt for s in scenes] for method in methods])
         counts = np.maximum(1, np.round(duration / JUDGED_FRAMES / dts)).astype(int)
         truths = [_sample_positions(s, ours.rk4, duration, _count_reference_steps(s, counts, duration)) for s in scenes]
-        error = np.array(
-            [
-                [
-                    [_measure_error(_sample_positions(s, m, duration, count), truth) for count in counts]
-                    for s, truth in zip(scenes, truths, strict=True)
-                ]
-                for m in methods
-            ]
-        )
+        pairs = list(zip(scenes, truths, strict=True))
+        measure = lambda s, m, truth, count: _measure_error(_sample_positions(s, m, duration, count), truth)  # noqa: E731
+        error = np.array([[[measure(s, m, truth, n) for n in counts] for s, truth in pairs] for m in methods])
     verdict = np.where(error <= INACCURATE_ERROR, 0, np.where(error <= DIVERGED_ERROR, 1, 2))
     actual = np.broadcast_to(duration / JUDGED_FRAMES / counts, error.shape)
     names = tuple(method_name(method) for method in methods)
@@ -101,12 +105,14 @@ def map(
 
 
 def _count_reference_steps(scene: Scene, counts: np.ndarray, duration: float) -> int:
-    """Steps of rk4 in a frame for the truth: finer than any run, and a tenth of what is stable."""
+    """Steps of rk4 in a frame for the truth: finer than any run, and a tenth of the largest stable step."""
     stable = limit(scene, ours.rk4).dt
-    return int(max(2 * counts.max(), np.ceil(10 * duration / JUDGED_FRAMES / stable) if 0 < stable < np.inf else 0))
+    enough = np.ceil(REFERENCE_STEPS_RATIO * duration / JUDGED_FRAMES / stable) if 0 < stable < np.inf else 0
+    return int(max(2 * counts.max(), enough))
 
 
 def _sample_positions(scene: Scene, method: Callable, duration: float, count: int) -> np.ndarray:
+    # dt and count are data: one compilation for each method and scene
     dt = jnp.asarray(duration / JUDGED_FRAMES / count)
     return np.asarray(
         sample_states(scene, as_module(method), dt, jnp.asarray(count, jnp.int32), JUDGED_FRAMES).position
@@ -114,8 +120,8 @@ def _sample_positions(scene: Scene, method: Callable, duration: float, count: in
 
 
 def _measure_error(positions: np.ndarray, truth: np.ndarray) -> float:
-    """The largest error in parts of the way gone (of the scene's size, if it rests); infinite for a run that blew up."""
+    """The largest error relative to the distance travelled (to the scene's size, if it rests); infinite if a run blew up."""
     way = np.abs(truth - truth[0]).max()
-    size = way if way > 1e-6 * np.abs(truth).max() else max(np.ptp(truth), 1e-300)
+    size = way if way > REST_SHARE * np.abs(truth).max() else max(np.ptp(truth), 1e-300)
     error = np.abs(positions - truth).max() / size
     return float(error) if np.isfinite(error) else float("inf")

@@ -1,13 +1,12 @@
 """Whether small deviations from a state grow, measured by running the scene: the test of every prediction.
 
 A scene that is not at rest moves on meanwhile, and its deviations grow and shrink with where it goes. So that a limit
-belongs to a state, what is run is the deviation alone, pushed by the forces it adds to those of that state; what of it
-grows whatever the method is taken out after every step.
+belongs to one state, only the deviation is run, under the forces that it adds to those of that state. The part of it that
+grows whatever the method is removed after every step.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.particles import Particles
@@ -31,11 +30,21 @@ from physjax.study.stability.linearisation import (
 from physjax.vectors import scale
 
 DEVIATION_SIZE_SHARE = 1e-10
-"""A deviation, in parts of the scene's size (or its way in the time of its fastest motion): far from rounding and curvature."""
+"""A deviation, relative to the scene's size (or its way in the time of its fastest motion): far from rounding and curvature."""
+SMALLEST_SIZE = 1e-3
+"""Size of a scene that has none, one node at rest [m]."""
 ESCAPE_FACTOR = 1e4
-"""What has grown by this has left the state it began at; it may well stop growing there."""
+"""A deviation that has grown by this has left the state it began at; it may well stop growing there."""
+GROWTH_RATIO = 1.5
+"""A deviation grows if it is this much larger in the second half of a run than in the first: beats stay below."""
+RATE_RANGE = 1e-3, 1e2
+"""Steps searched for a limit, times the fastest rate: five decades about every known method's."""
+TRIAL_ROUNDS = 3
+"""Rounds of trials, each within the gap that the last left."""
+EARLY_STEPS = 4
+"""Steps at the beginning of a run in which the size of a deviation is taken."""
 TRIAL_STEPS = 16
-"""Steps tried at once; three rounds of them find a limit among five decades within 0.3 %."""
+"""Steps tried at once; three rounds of them narrow five decades down to 0.3 %."""
 
 
 def measure_limit(
@@ -49,8 +58,8 @@ def measure_limit(
     """The largest dt [s] at which `steps` steps do not make a small deviation from a state grow: by batched bisection.
 
     About the scene's state, if none is given, and shaped like `scene.status_shape`. Slow growth needs many `steps` to
-    be seen: a method that is never stable shows the dt up to which nobody notices. What grows by itself
-    (`grows_by_itself`) is left out. Looks `between` two steps [s], by default five decades around the
+    be seen: a method that is never stable shows the dt up to which its growth goes unnoticed. Motions that grow by
+    themselves (`grows_by_itself`) are left out. The search is `between` two steps [s], by default five decades around the
     fastest rate of the scene; 0 or infinity where the limit is outside.
 
     Example:
@@ -61,7 +70,7 @@ def measure_limit(
         scene, state = prepare_linearisation(scene, at)
         bottom, top = _choose_range(scene, state) if between is None else _check_range(between, scene)
         low, high = bottom, top
-        for _ in range(3):
+        for _ in range(TRIAL_ROUNDS):
             tried = np.geomspace(low, high, TRIAL_STEPS)
             bad = grows(scene, method, tried, state, steps=steps)
             first = np.where(bad.any(axis=0), bad.argmax(axis=0), TRIAL_STEPS)
@@ -70,10 +79,12 @@ def measure_limit(
         return np.where(high <= bottom, 0.0, np.where(low >= top, np.inf, low))
 
 
-def grows(scene: Scene, method: Callable, dt: Any, at: Particles | None = None, *, steps: int = 4000) -> np.ndarray:
+def grows(
+    scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None = None, *, steps: int = 4000
+) -> np.ndarray:
     """Whether a small deviation grows in a run with steps of dt [s], for each scene (lane, where they are independent).
 
-    Unstable is a dt at which it is half as large again in the second half of the run as it ever was in the first, or
+    A dt is unstable if the deviation is half as large again in the second half of the run as it ever was in the first, or
     has left for good. `dt` has `scene.status_shape` or is a number; leading axes are further trials.
 
     Example:
@@ -81,14 +92,14 @@ def grows(scene: Scene, method: Callable, dt: Any, at: Particles | None = None, 
         [False, True]
     """
     begin, early, late = _measure_deviations(scene, method, dt, at, steps)
-    # what comes to rest elsewhere has left as well
-    return ~((late <= 1.5 * early) & (np.maximum(early, late) <= ESCAPE_FACTOR * begin))
+    # a deviation that comes to rest elsewhere has left as well; written so that NaN grows
+    return ~((late <= GROWTH_RATIO * early) & (np.maximum(early, late) <= ESCAPE_FACTOR * begin))
 
 
 def measure_growth(
-    scene: Scene, method: Callable, dt: Any, at: Particles | None = None, *, steps: int = 2000
+    scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None = None, *, steps: int = 2000
 ) -> np.ndarray:
-    """By how much a small deviation grows in a step of dt [s], on average over half a run; infinite if it blew up.
+    """The factor by which a small deviation grows in a step of dt [s], on average over half a run; infinite if it blew up.
 
     Example:
         >>> round(float(stability.measure_growth(swing, methods.euler, 0.5, steps=100)), 2)
@@ -101,7 +112,7 @@ def measure_growth(
 
 def _choose_range(scene: Scene, state: Particles) -> tuple[np.ndarray, np.ndarray]:
     fastest_rate = _find_fastest_rate(linearise(scene, state))
-    return 1e-3 / fastest_rate, 1e2 / fastest_rate
+    return RATE_RANGE[0] / fastest_rate, RATE_RANGE[1] / fastest_rate
 
 
 def _find_fastest_rate(motion: SmallMotion) -> np.ndarray:
@@ -110,31 +121,35 @@ def _find_fastest_rate(motion: SmallMotion) -> np.ndarray:
     return np.where(fastest > 0, fastest, 1.0)
 
 
-def _check_range(between: Any, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _check_range(between: tuple[float, float], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     low, high = (float(as_real_quantity("between [s]", number, above=0.0)) for number in between)
     if low >= high:
         raise ValueError(f"between [s]: got {low:g} and {high:g}, expected the smaller step first.")
     return np.full(scene.status_shape, low), np.full(scene.status_shape, high)
 
 
+OwnGrowth = tuple[ArrayLike, ArrayLike | None]
+"""The projector on motions that grow by themselves, and the basis it is written in (None: the lanes' components)."""
+
+
 class _DeviationForce(Force):
-    """What a deviation from a state adds to the forces of a scene there."""
+    """The forces that a deviation from a state adds to those of a scene there."""
 
     scene: Scene
     state: Particles
 
     @property
-    def couples(self) -> bool:
+    def couples(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  as the scene's forces do
         return self.scene.couples
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Array) -> Array:
         now = jnp.zeros((), state.dtype)
-        there = jax.tree.map(jnp.add, self.state, state)
-        return scale(mass, self.scene.acceleration(now, there) - self.scene.acceleration(now, self.state))
+        deviated = jax.tree.map(jnp.add, self.state, state)
+        return scale(mass, self.scene.acceleration(now, deviated) - self.scene.acceleration(now, self.state))
 
 
 def _measure_deviations(
-    scene: Scene, method: Callable, dt: Any, at: Particles | None, steps: int
+    scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None, steps: int
 ) -> tuple[np.ndarray, ...]:
     """The largest velocity of a deviation at the beginning, in the first and in the second half of a run."""
     steps = as_positive_integer("steps", steps, at_least=64)
@@ -146,10 +161,9 @@ def _measure_deviations(
         trials = np.broadcast_to(dt, (*leading, *status)).reshape((-1, *status))
         motion = linearise(scene, state)
         method = as_module(method)
-        fastest_rate, growth_projector = (
-            jnp.asarray(_find_fastest_rate(motion)),
-            motion.growth_projector(motion.undamped and not follows_rates(method)),
-        )
+        fastest_rate = jnp.asarray(_find_fastest_rate(motion))
+        # without damping a method that kicks and drifts keeps the decaying partners of growing modes as well
+        growth_projector = motion.growth_projector(partners=motion.undamped and not follows_rates(method))
         own = None if growth_projector is None else (growth_projector, motion.basis)
         found = _run_deviations(scene, state, method, fastest_rate, own, jnp.asarray(trials), steps)
         return tuple(np.asarray(a).reshape((*leading, *status)) for a in found)
@@ -157,30 +171,37 @@ def _measure_deviations(
 
 @eqx.filter_jit
 def _run_deviations(
-    scene: Scene, state: Particles, method: Any, fastest_rate: Array, own: Any, dts: Array, steps: int
+    scene: Scene,
+    state: Particles,
+    method: Callable,
+    fastest_rate: Float[Array, "..."],
+    own: OwnGrowth | None,
+    dts: Float[Array, "trials ..."],
+    steps: int,
 ) -> tuple[Array, Array, Array]:
+    """The largest velocity of a deviation early, in the first and in the second half of a run, for each trial."""
     x, v = state
     reach = jnp.maximum(jnp.max(jnp.abs(x - jnp.mean(x))), jnp.max(jnp.abs(v)) / jnp.max(fastest_rate))
-    size = DEVIATION_SIZE_SHARE * jnp.maximum(reach, 1e-3)
+    size = DEVIATION_SIZE_SHARE * jnp.maximum(reach, SMALLEST_SIZE)
     keys = jax.random.split(jax.random.key(0))
     push, speed = (size * jax.random.normal(key, x.shape, x.dtype) for key in keys)
-    # pushed in both, in the proportion of the fastest mode: slower ones have then begun to move as well
+    # positions and velocities in the proportion of the fastest mode: slower modes then move as well
     start = Particles(push, scale(fastest_rate, speed))
     if scene.held is not None:
         start = jax.tree.map(lambda leaf: scale(1 - scene.held.astype(x.dtype), leaf), start)
-    rest = (lambda state: state) if own is None else partial(_remove_own_growth, own, scene)
-    start = rest(start)
+    remove_growth = (lambda state: state) if own is None else partial(_remove_own_growth, own, scene)
+    start = remove_growth(start)
     deviation = Scene(start, mass=scene.mass, forces=(_DeviationForce(scene, state),), pinned=scene.held)
     inner = (-2, -1) if scene.couples else -1
 
-    def run(dt):
-        def step(i, carry):
+    def run(dt: Array) -> tuple[Array, Array, Array]:
+        def step(i: Array, carry: tuple) -> tuple:
             state, worst = carry
-            state = rest(deviation.replace(state=state).step(method, i.astype(x.dtype) * dt, dt).state)
-            apart = jnp.max(jnp.abs(state.velocity), axis=inner)
-            apart = jnp.where(jnp.isfinite(apart), apart, jnp.inf)
-            spans = (i < 4, i < steps // 2, i >= steps // 2)
-            worst = tuple(jnp.where(now, jnp.maximum(w, apart), w) for now, w in zip(spans, worst, strict=True))
+            state = remove_growth(deviation.replace(state=state).step(method, i.astype(x.dtype) * dt, dt).state)
+            speed = jnp.max(jnp.abs(state.velocity), axis=inner)
+            speed = jnp.where(jnp.isfinite(speed), speed, jnp.inf)  # a maximum would pass over NaN
+            spans = (i < EARLY_STEPS, i < steps // 2, i >= steps // 2)
+            worst = tuple(jnp.where(now, jnp.maximum(w, speed), w) for now, w in zip(spans, worst, strict=True))
             return state, worst
 
         zero = jnp.zeros(scene.status_shape, x.dtype)
@@ -189,14 +210,15 @@ def _run_deviations(
     return jax.vmap(run)(dts)
 
 
-def _remove_own_growth(own: tuple, scene: Scene, state: Particles) -> Particles:
-    """A deviation less what it has of motions that grow by themselves."""
+def _remove_own_growth(own: OwnGrowth, scene: Scene, state: Particles) -> Particles:
+    """A deviation without its part of motions that grow by themselves."""
     growth_projector, basis = own
     weight = sqrt_mass(scene, state)
     blocks = growth_projector.shape[:-2]
     both = [(leaf * weight).reshape((*blocks, -1)) for leaf in state]
-    seen = both if basis is None else [jnp.einsum("...ij,...j->...i", basis, a) for a in both]
-    grown = jnp.einsum("...ij,...j->...i", growth_projector, jnp.concatenate(seen, axis=-1))
+    # into the coordinates of the modes and back, where only the fastest are known
+    reduced = both if basis is None else [jnp.einsum("...ij,...j->...i", basis, a) for a in both]
+    grown = jnp.einsum("...ij,...j->...i", growth_projector, jnp.concatenate(reduced, axis=-1))
     parts = jnp.split(grown, 2, axis=-1)
     parts = parts if basis is None else [jnp.einsum("...ij,...i->...j", basis, a) for a in parts]
     return Particles(*(leaf - a.reshape(leaf.shape) / weight for leaf, a in zip(state, parts, strict=True)))

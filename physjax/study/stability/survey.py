@@ -1,10 +1,10 @@
-"""Where a scene of the gallery is fastest, and the map of what every method does with it around its limits."""
+"""When the small motions of a gallery scene are fastest, and the map of every method around its limits."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from physjax.scene import Scene
 from physjax.stepping.methods import METHODS
@@ -14,22 +14,25 @@ from physjax.study.stability.limits import Limit
 from physjax.study.stability.linearisation import linearise, prepare_linearisation
 
 INSPECTED_FRAMES = 16
-"""Moments of a run at which its small motions are looked at."""
+"""Moments of a run at which its small motions are linearised."""
 MAP_STEPS = 48
 """Steps of a map, from a tenth of the shortest limit to three times the longest."""
 
 
-def find_fastest_moment(problem: Problem) -> tuple[float, Any]:
-    """The moment [s] of a run, of a few, at which small motions are fastest, and the state then."""
+def find_fastest_moment(problem: Problem) -> tuple[float, PyTree]:
+    """Of a few moments of a run, the one [s] at which small motions are fastest, and the state then."""
     flight = problem.reference()
 
-    def pace(i: int) -> float:
-        with jax.enable_x64(True):
-            return float(np.abs(linearise(*prepare_linearisation(problem.scene, state(i))).rates()).max())
+    def pick_state(frame: int) -> PyTree:
+        return jax.tree.map(lambda leaf: leaf[frame], flight.state)
 
-    state = lambda i: jax.tree.map(lambda leaf: leaf[i], flight.state)  # noqa: E731
-    fastest = max(range(0, len(flight.time), max(1, len(flight.time) // INSPECTED_FRAMES)), key=pace)
-    return float(flight.time[fastest]), state(fastest)
+    def find_fastest_rate(frame: int) -> float:
+        with jax.enable_x64(True):
+            return float(linearise(*prepare_linearisation(problem.scene, pick_state(frame))).fastest_rate().max())
+
+    frames = range(0, len(flight.time), max(1, len(flight.time) // INSPECTED_FRAMES))
+    fastest = max(frames, key=find_fastest_rate)
+    return float(flight.time[fastest]), pick_state(fastest)
 
 
 def map_around_limits(scene: Scene, limits: Sequence[Limit]) -> stability.StabilityMap | None:
