@@ -87,7 +87,7 @@ def time_in_turn(
     while runs and (len(turns[0]) < least or (len(turns[0]) < most and time.perf_counter() - started < seconds)):
         for run, taken in zip(runs, turns, strict=True):
             taken.append(_time_turn(run, slice_seconds))
-    return [Timing(*zip(*taken, strict=True)) for taken in turns]
+    return [Timing(tuple(s for s, _ in taken), tuple(busy for _, busy in taken)) for taken in turns]
 
 
 def _time_turn(run: Callable[[], object], slice_seconds: float) -> tuple[float, float]:

@@ -1,14 +1,15 @@
 """One display name and one line style for each method, the same in every chart and table."""
 
 from itertools import product
-from typing import NamedTuple, TypedDict
+from typing import Literal, NamedTuple, Required, TypedDict
 
 from physjax.stepping.methods import METHODS
 
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
 """Okabe and Ito's colours, told apart by colour-blind readers too; two more for methods to come."""
 MARKERS = "osD^vPX*"
-RIVAL_STYLES = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
+Dashes = Literal["-", "--", "-.", ":"]
+RIVAL_STYLES: dict[str, tuple[str, Dashes]] = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
 """Grey and line of the solvers of other libraries."""
 AS_GIVEN, PROJECTED = "as given", "projected"
 """Treatments of contacts: by the response that the scene gives them; resolved at the end of the step instead."""
@@ -34,9 +35,9 @@ class Variant(NamedTuple):
 class LineStyle(TypedDict, total=False):
     """Keywords of a matplotlib line."""
 
-    color: str
+    color: Required[str]
     marker: str
-    linestyle: str
+    linestyle: Dashes
     linewidth: float
     markersize: float
     markerfacecolor: str
@@ -85,7 +86,9 @@ def _style_variant(variant: Variant) -> LineStyle:
         "markersize": 4.5,
     }
     if variant.treatment == PROJECTED:
-        line |= {"linestyle": "--", "linewidth": 1.1, "markerfacecolor": "white"}
+        line.update(linestyle="--", linewidth=1.1, markerfacecolor="white")
     if variant.adaptive:
-        line |= {"linestyle": "-.", "marker": "*", "markersize": 7}
-    return line | {"alpha": 0.45, "linewidth": 1.0, "markersize": 3} if variant.dtype == "float32" else line
+        line.update(linestyle="-.", marker="*", markersize=7)
+    if variant.dtype == "float32":
+        line.update(alpha=0.45, linewidth=1.0, markersize=3)
+    return line

@@ -14,6 +14,7 @@ from physjax.show.style import AS_GIVEN
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
+from physjax.study.accuracy.recommendation import Recommendation
 from physjax.study.accuracy.result import TABLE_ERRORS, Run, WorkPrecision
 from physjax.study.energy.audit import RESPONSE_OBSERVERS
 from physjax.study.problem import Problem
@@ -66,15 +67,21 @@ class SceneStudy(NamedTuple):
     @property
     def stepping(self) -> Stepping:
         """That run as options of `simulate`."""
-        steps, problem = self.run.steps, self.problem
-        method, every = METHODS[self.run.scheme], steps // problem.frames
+        run, problem = self._demand_run(), self.problem
+        steps, method, every = run.steps, METHODS[run.scheme], run.steps // problem.frames
         return {"method": method, "dt": problem.duration / steps, "duration": problem.duration, "save_every": every}
 
     @property
     def stepping_text(self) -> str:
         """That run in words."""
-        run = self.run
-        return f"Stepped by {run.method} with dt = {format_seconds(run.dt)}, whose error is {run.path_error:.1e} of the path."
+        run = self._demand_run()
+        step = format_seconds(self.problem.duration / run.steps)
+        return f"Stepped by {run.method} with dt = {step}, whose error is {run.path_error:.1e} of the path."
+
+    def _demand_run(self) -> Run:
+        if self.run is None:
+            raise ValueError(NO_RUN)
+        return self.run
 
 
 def build_sections(
@@ -195,6 +202,7 @@ def _chart_ablation(studied: SceneStudy) -> Iterator[Block]:
 def _write_recommendation(studied: SceneStudy) -> Iterator[Block]:
     problem = studied.problem
     answers = accuracy.recommend(problem.scene, error=TABLE_ERRORS, horizon=problem.duration, progress=False)
+    assert not isinstance(answers, Recommendation)  # several errors have several answers
     for answer in answers:
         yield f"For an error of {answer.error:g}: {answer.reason}"
     yield Table("\n\n".join(map(str, answers)))

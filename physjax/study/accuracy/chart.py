@@ -124,11 +124,11 @@ def _mark_horizon(ax: "Axes", time: np.ndarray, position: np.ndarray, horizon: f
 def _draw_curves(ax: "Axes", result: WorkPrecision, x: Number, y: Callable[[Run], float], floor: float = 0.0) -> None:
     """A line for each method through the runs that stayed on the path, and crosses on the upper edge for the others."""
     for method in result.methods:
-        runs = [run for run in result.of(method) if x(run) is not None]
-        good = [run for run in runs if run.status == "ok"]
+        runs = [(across, run) for run in result.of(method) if (across := x(run)) is not None]
+        good = [(across, max(y(run), SMALLEST_DRAWN_ERROR)) for across, run in runs if run.status == "ok"]
         line = _style_of(result, method)
-        ax.plot([x(run) for run in good], [max(y(run), SMALLEST_DRAWN_ERROR) for run in good], **line)
-        failed = [x(run) for run in runs if run.status != "ok"]
+        ax.plot([across for across, _ in good], [up for _, up in good], **line)
+        failed = [across for across, run in runs if run.status != "ok"]
         edge = ax.get_xaxis_transform()
         ax.plot(failed, [0.975] * len(failed), "x", color=line["color"], transform=edge, markersize=6, clip_on=False)
     if floor:
@@ -149,17 +149,15 @@ def _style_of(result: WorkPrecision, method: str) -> LineStyle:
 
 def _draw_legend(figure: "Figure", result: WorkPrecision) -> float:
     """The legend, which stands below the panels; returns the share of the figure's height that they must leave to it."""
-    from matplotlib import pyplot as plt
+    from matplotlib.lines import Line2D
 
     # where both treatments of contacts ran, each has a column of its own, a method to a line
     methods = sorted(result.methods, key=lambda method: result.of(method)[0].treatment == PROJECTED)
     projected = result.of(methods[-1])[0].treatment == PROJECTED
-    handles = [
-        plt.Line2D([], [], **_style_of(result, method), label=_format_label(result, method)) for method in methods
-    ]
-    failed = plt.Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
+    handles = [Line2D([], [], **_style_of(result, method), label=_format_label(result, method)) for method in methods]
+    failed = Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
     handles.insert(len(methods) // 2 if projected else len(methods), failed)
-    handles.append(plt.Line2D([], [], **FRONT_BAND_STYLE, label="Pareto's front"))
+    handles.append(Line2D([], [], **FRONT_BAND_STYLE, label="Pareto's front"))
     columns = 2 if projected else 3
     title = (
         "solid: impacts found inside the step; dashed, hollow: projected at the end of the step" if projected else None

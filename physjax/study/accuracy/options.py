@@ -52,9 +52,9 @@ class Options(NamedTuple):
 
     conserved: Sequence[Conserved] = ()
     norms: Sequence[ErrorMeasure | Callable] = ()
-    rivals: "Sequence[diffrax.AbstractAdaptiveSolver] | None" = None
+    rivals: "Sequence[diffrax.AbstractERK] | None" = None
     tolerances: Sequence[float] = TOLERANCES
-    dtype: DTypeLike | Sequence[DTypeLike] = np.float64
+    dtype: DTypeLike | list[DTypeLike] | tuple[DTypeLike, ...] = np.float64
     batch: int = 1
     gradient: bool = False
     name: str = "scene"

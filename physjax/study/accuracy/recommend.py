@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from jax.typing import ArrayLike
 from tqdm import tqdm
 
 from physjax.checks import as_positive_integer, as_real_quantity
@@ -100,7 +99,9 @@ def recommend(
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
 
 
-def _check_request(scene: Scene, error: ArrayLike, horizon: float, frames: int) -> tuple[Problem, list[float]]:
+def _check_request(
+    scene: Scene, error: float | Sequence[float], horizon: float, frames: int
+) -> tuple[Problem, list[float]]:
     if not isinstance(scene, Scene):
         raise TypeError(f"recommend: got a {type(scene).__name__}, expected a Scene.")
     as_real_quantity("error", error, above=0.0)
@@ -118,7 +119,7 @@ def list_candidates(scene: Scene) -> list[Callable]:
     late, velocity_dependent = scene.resolves_at_step_end, depends_on_velocity(scene)
 
     def rate_merit(method: Callable) -> tuple[float, ...]:
-        promises = read_promises(method)
+        promises = method.promises  # every method of the registry has them
         limit = min(promises.stability_limit, LARGEST_COMPARED_LIMIT)
         return promised_order(method, velocity_dependent, scene), -promises.evaluations, limit
 

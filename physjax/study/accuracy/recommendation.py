@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from physjax.scene import Scene
 from physjax.stepping.reference import cast_floats
@@ -68,15 +69,24 @@ class Recommendation(NamedTuple):
         remarks = "" if np.isnan(self.richardson) else f"; by Richardson against half its step {self.richardson:.1e}"
         return f"{self.best.error:.1e} measured against {self.truth}, itself right to {self.truth_error:.1e}{remarks}"
 
-    def simulate(self, **options: object) -> Trajectory:
+    def simulate(
+        self, *, save_every: int | None = None, record: Callable | None = None, first_step: ArrayLike = 0
+    ) -> Trajectory:
         """Run the scene as recommended, over the horizon; options as for `simulate`. ValueError where nothing keeps the error."""
         if self.best is None:
             raise ValueError(f"recommend: nothing keeps an error of {self.error:g}: {self.reason}")
         best, steps = self.best, self.best.steps_per_frame
         with jax.enable_x64(best.dtype == "float64"):
             scene = cast_floats(self.scene, best.dtype)
-            options = {"save_every": steps} | options
-            return simulate(scene, best.method, dt=best.dt, steps=steps * self.frames, **options)
+            return simulate(
+                scene,
+                best.method,
+                dt=best.dt,
+                steps=steps * self.frames,
+                save_every=steps if save_every is None else save_every,
+                record=record,
+                first_step=first_step,
+            )
 
     def __str__(self) -> str:
         title = f"error {self.error:g} ({self.norm}) over {format_seconds(self.horizon)}"

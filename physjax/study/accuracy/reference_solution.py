@@ -153,11 +153,14 @@ def solve_reference(
             _measure_reach(scene, problem.times, states, between),
         )
     few = sum(leaf.size for leaf in jax.tree.leaves(scene.state)) <= MAX_DIFFRAX_NUMBERS
-    found = None
     if problem.is_ode and own is None and few:
         # equal steps get through where an adaptive solver gives up, such as a force that switches about zero
         found = _build_reference(problem, scene, *_make_diffrax_solver(problem, push), strict=True)
-    return found or _build_reference(problem, scene, *_make_own_solver(problem, own or rk4, wanted, seconds, push))
+        if found is not None:
+            return found
+    found = _build_reference(problem, scene, *_make_own_solver(problem, own or rk4, wanted, seconds, push))
+    assert found is not None  # only a strict one may be
+    return found
 
 
 def _build_reference(

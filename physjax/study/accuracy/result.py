@@ -113,18 +113,20 @@ class WorkPrecision(NamedTuple):
         step it happens to fall. The truth's own error counts as rounding, but no run is called exact by such a truth.
         """
         runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
-        resolved = [run for run in runs if self._rounding_error(run) < run.path_error < LARGEST_FITTED_ERROR]
         if runs and all(run.path_error <= self._rounding_error(run) for run in runs):
             return float("inf") if self.floor <= MAX_EXACT_FLOOR else float("nan")
-        if not resolved:
-            return float("nan")
-        scattered = self.scattered or resolved[-1].treatment == PROJECTED
-        finest = [run for run in resolved if run.dt < FITTED_STEPS_RATIO * resolved[-1].dt or scattered]
-        errors = [run.path_error for run in finest]
+        resolved = [
+            (run.dt, run.path_error)
+            for run in runs
+            if run.dt is not None and self._rounding_error(run) < run.path_error < LARGEST_FITTED_ERROR
+        ]
+        scattered = self.scattered or any(run.treatment == PROJECTED for run in runs)
+        finest = [(dt, error) for dt, error in resolved if dt < FITTED_STEPS_RATIO * resolved[-1][0] or scattered]
+        errors = [error for _, error in finest]
         # errors that scatter show a slope only if they fall by much more than they scatter
         if len(finest) < 3 or (scattered and max(errors) < LEAST_SCATTERED_FALL * min(errors)):
             return float("nan")
-        return float(np.polyfit(np.log([run.dt for run in finest]), np.log(errors), 1)[0])
+        return float(np.polyfit(np.log([dt for dt, _ in finest]), np.log(errors), 1)[0])
 
     def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
         """The run with the least time whose path error stays below `error`; None if none does."""

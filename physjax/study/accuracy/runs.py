@@ -169,7 +169,7 @@ def run_gradient(comparison: Comparison, scene: Scene, method: Callable, treatme
     return runs
 
 
-def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractAdaptiveSolver") -> list[Run]:
+def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractERK") -> list[Run]:
     """A diffrax solver with adaptive steps, from loose to tight tolerance; one compilation."""
     size = smallest_size(scene)
     times = jnp.asarray(comparison.truth.times, scene.state.dtype)
@@ -188,7 +188,7 @@ def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractAda
         states, success, stats = compiled(scene, *arguments(tol))
         steps, measured = int(stats["num_steps"]), comparison.measure_errors(scene, states)
         if not success:
-            measured |= {"final_error": float("nan"), "path_error": float("nan")}
+            measured["final_error"] = measured["path_error"] = float("nan")
         runs.append(
             Run(
                 method=name,
@@ -218,7 +218,7 @@ def _solve_copies(
     end: Array,
     rtol: Array,
     atol: Array,
-    solver: "diffrax.AbstractAdaptiveSolver",
+    solver: "diffrax.AbstractERK",
     strict: bool,
 ) -> PyTree:
     """States of stacked copies by a diffrax solver."""

@@ -69,11 +69,8 @@ def work_precision(
     """
     options = merge_options("work_precision", options, more)
     problem = _as_problem(problem, duration, exact, options.conserved)
-    options = options._replace(
-        rivals=_check_rivals(problem, options.rivals),
-        norms=tuple(as_error_measure(norm) for norm in options.norms),
-        batch=as_positive_integer("batch", options.batch),
-    )
+    rivals, batch = _check_rivals(problem, options.rivals), as_positive_integer("batch", options.batch)
+    norms = tuple(as_error_measure(norm) for norm in options.norms)
     if dts is not None:
         dts = np.atleast_1d(np.asarray(as_real_quantity("dts [s]", dts, above=0.0), float))
     with jax.enable_x64(True):
@@ -82,13 +79,13 @@ def work_precision(
         closer = problem._replace(frames=problem.frames * REFERENCE_FRAMES_PER_FRAME)
         detailed = solve_reference(closer, wanted=REFERENCE_ERROR, push=push)
         truth = _pick_frames(detailed)
-        comparison = Comparison(problem, truth, options.norms, budget, dts, options.tolerances, options.batch)
+        comparison = Comparison(problem, truth, norms, budget, dts, options.tolerances, batch)
         chosen = list(METHODS.values()) if methods is None else list(methods)
         runs, slopes, promised = _run_methods(comparison, chosen, options, push)
-        for solver in options.rivals:
+        for solver in rivals:
             options.progress(f"diffrax {type(solver).__name__}")
             runs += run_rival(comparison, cast_floats(problem.scene, _list_dtypes(options)[0]), solver)
-    return _gather_result(problem, detailed, options, runs, slopes, promised)
+    return _gather_result(comparison, detailed, options, runs, slopes, promised)
 
 
 def _run_methods(
@@ -108,14 +105,14 @@ def _run_methods(
 
 
 def _gather_result(
-    problem: Problem,
+    comparison: Comparison,
     detailed: ReferenceSolution,
     options: Options,
     runs: list[Run],
     slopes: list[Run],
     promised: dict[str, float],
 ) -> WorkPrecision:
-    dtypes = _list_dtypes(options)
+    problem, dtypes = comparison.problem, _list_dtypes(options)
     return WorkPrecision(
         name=options.name,
         runs=tuple(runs),
@@ -127,9 +124,9 @@ def _gather_result(
         dtype=" and ".join(dtype.name for dtype in dtypes),
         path=(detailed.times, detailed.states.position),
         scattered=problem.scene.resolves_at_step_end,
-        norms=tuple(norm.name for norm in options.norms),
+        norms=tuple(norm.name for norm in comparison.norms),
         horizon=detailed.horizon(HORIZON_ERROR_SHARE, float(np.finfo(dtypes[0]).eps)),
-        batch=options.batch,
+        batch=comparison.batch,
         gradients=tuple(slopes),
     )
 
@@ -167,8 +164,8 @@ def _as_problem(
 
 
 def _check_rivals(
-    problem: Problem, rivals: "Sequence[diffrax.AbstractAdaptiveSolver] | None"
-) -> "Sequence[diffrax.AbstractAdaptiveSolver]":
+    problem: Problem, rivals: "Sequence[diffrax.AbstractERK] | None"
+) -> "Sequence[diffrax.AbstractERK]":
     if rivals is None:
         return default_rivals() if problem.is_ode else ()
     if rivals and not problem.is_ode:
@@ -179,7 +176,7 @@ def _check_rivals(
     return rivals
 
 
-def default_rivals() -> "tuple[diffrax.AbstractAdaptiveSolver, ...]":
+def default_rivals() -> "tuple[diffrax.AbstractERK, ...]":
     """The adaptive solvers that a user of diffrax would reach for first: Tsit5, and Dopri8 for many digits.
 
     Example:

@@ -68,7 +68,7 @@ def _find_worst_spring(
     still = jnp.zeros_like(state.velocity)
     stretch = [
         np.asarray(jax.jvp(springs.length, (state,), (Particles(jnp.asarray(part), still),))[1])
-        for part in (moved.real, moved.imag)
+        for part in (np.real(moved), np.imag(moved))
     ]
     number = np.asarray(springs.damping if kind else springs.stiffness)
     share = np.broadcast_to(number, stretch[0].shape) * (stretch[0] ** 2 + stretch[1] ** 2)

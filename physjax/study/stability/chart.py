@@ -26,7 +26,7 @@ def draw_region(result: Region, ax: "Axes | None" = None) -> "Axes":
 
     if ax is None:
         ax = plt.figure(figsize=(5, 5), layout="constrained").add_subplot()
-    x, y = result.z.real, result.z.imag
+    x, y = np.real(result.z), np.imag(result.z)
     ax.contourf(x, y, result.radius, levels=[0, BOUNDARY_RADIUS], colors=[VERDICT_COLOURS[0]])
     ax.contour(x, y, result.radius, levels=[BOUNDARY_RADIUS], colors=[style(result.name)["color"]], linewidths=1.5)
     ax.axhline(0, color="0.7", linewidth=0.8)
@@ -39,6 +39,8 @@ def draw_region(result: Region, ax: "Axes | None" = None) -> "Axes":
 def draw_stability_map(result: StabilityMap, figure: "Figure | None" = None) -> "Figure":
     """Verdicts over dt: a row for each method, or a panel for each where a parameter changes; returns the figure."""
     from matplotlib import pyplot as plt
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Rectangle
 
     swept = bool(result.parameter)
     count = len(result.methods) if swept else 1
@@ -58,8 +60,8 @@ def draw_stability_map(result: StabilityMap, figure: "Figure | None" = None) -> 
                 ax.set_yscale("log")
     else:
         _draw_strips(panels[0], result)
-    handles = [plt.Rectangle((0, 0), 1, 1, color=c) for c in VERDICT_COLOURS] + [
-        plt.Line2D([], [], color="black", linewidth=1.8)
+    handles = [Rectangle((0, 0), 1, 1, color=c) for c in VERDICT_COLOURS] + [
+        Line2D([], [], color="black", linewidth=1.8)
     ]
     words = (f"stable, error < {100 * INACCURATE_ERROR:g} % of the way", "inaccurate", "diverged", "predicted limit")
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
@@ -85,7 +87,7 @@ def _draw_strips(ax: "Axes", result: StabilityMap) -> None:
         else:
             edge, side = (0.01, "left") if limit == 0 or limit < result.dts.min() else (0.99, "right")
             text = "never stable" if limit == 0 else "limit beyond this edge"
-            ax.text(edge, place, text, transform=ax.get_yaxis_transform(), ha=side, va="center", fontsize=8.5)
+            ax.text(edge, float(place), text, transform=ax.get_yaxis_transform(), ha=side, va="center", fontsize=8.5)
     ax.hlines(places[:-1] + 0.5, *ax.get_xlim(), color="white", linewidth=2)
     ax.set_yticks(places, [name.replace("_", " ") for name in result.methods])
     ax.set_ylim(len(places) - 0.5, -0.5)

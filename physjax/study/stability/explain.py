@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.particles import Particles, demand_particles
@@ -132,7 +133,7 @@ _INPUT_CURE = (
 
 def _explain_run(run: Trajectory) -> Explanation:
     """The first cause that fits, in an order in which none hides behind the consequences of another."""
-    scene, method, step = run.scene, run.method, float(np.min(np.asarray(run.dt)))
+    scene, method, step = _read_scene(run), run.method, float(np.min(np.asarray(run.dt)))
     as_real_quantity("dt [s]", step, above=0.0)
     first, node = _find_first_failure(run)
     sound = _describe_sound_run(run, first, node)
@@ -164,7 +165,7 @@ def _describe_sound_run(run: Trajectory, first: int, node: tuple[int, ...]) -> E
 
 def _check_rates(run: Trajectory, sound: Explanation) -> Explanation:
     """Whether the step exceeds a limit at a moment of the run, or is too long to follow the fastest motion."""
-    scene, method, step = run.scene, run.method, sound.dt
+    scene, method, step = _read_scene(run), run.method, sound.dt
     found = [(t, limit(scene, method, at=state), state) for t, state in _pick_moments(run, scene)]
     exceeded = [moment for moment in found if step > moment[1].dt * (1 + LIMIT_TOLERANCE)]
     if exceeded:
@@ -188,6 +189,24 @@ def _check_rates(run: Trajectory, sound: Explanation) -> Explanation:
     )
 
 
+def _demand(scene: Scene | None) -> Scene:
+    if scene is None:
+        raise TypeError(_INCOMPLETE_RUN)
+    return scene
+
+
+def _read_scene(run: Trajectory) -> Scene:
+    """The scene that a run began with; a TypeError for a run without one."""
+    return _demand(run.scene)
+
+
+def _read_dt(run: Trajectory) -> Array | np.ndarray:
+    """The steps of a run [s]; a TypeError for a run without any."""
+    if run.dt is None:
+        raise TypeError(_INCOMPLETE_RUN)
+    return run.dt
+
+
 def _starts_finite(scene: Scene, lane: int | tuple[int, ...] | None) -> bool:
     """Whether a scene, or one lane of it, starts with finite numbers."""
     finite = np.asarray(scene.finite(scene.state))
@@ -203,7 +222,7 @@ def _run_single_lane(
     every, first_step = max(1, steps // INSPECTED_FRAMES), 0
     if isinstance(run, Trajectory):
         method, dt, steps, every, first_step = run.method, run.dt, run.steps, run.save_every, run.first_step
-        run = run.scene
+        run = _read_scene(run)
     if not isinstance(run, Scene) or method is None or dt is None:
         raise TypeError(_INCOMPLETE_RUN)
     step = np.asarray(dt)[lane] if np.ndim(dt) else dt
@@ -217,9 +236,10 @@ def _find_first_failure(run: Trajectory) -> tuple[int, tuple[int, ...]]:
     if not (bad >= 0).any():
         return -1, ()
     first = int(bad[bad >= 0].min())
-    before = run.scene.state
+    scene, dt = _read_scene(run), _read_dt(run)
+    before = scene.state
     if first > int(run.first_step) + 1:
-        flight = simulate(run.scene, run.method, dt=run.dt, steps=first - int(run.first_step) - 1, record=_record_state)
+        flight = simulate(scene, run.method, dt=dt, steps=first - int(run.first_step) - 1, record=_record_state)
         before = Particles(*(leaf[-1] for leaf in flight.recorded))
     speed = np.abs(np.asarray(before.velocity, float)).max(axis=-1)
     return first, tuple(int(i) for i in np.unravel_index(np.argmax(speed), speed.shape))
@@ -227,13 +247,14 @@ def _find_first_failure(run: Trajectory) -> tuple[int, tuple[int, ...]]:
 
 def _fails_in_contact(run: Trajectory, first: int) -> bool:
     """Whether the first bad step is finite without the contacts."""
-    if first < 0 or not run.scene.contacts:
+    scene, dt = _read_scene(run), _read_dt(run)
+    if first < 0 or not scene.contacts:
         return False
-    before, scene = first - int(run.first_step) - 1, run.scene
+    before = first - int(run.first_step) - 1
     if before:
-        flight = simulate(scene, run.method, dt=run.dt, steps=before, save_every=before, first_step=int(run.first_step))
-        scene = flight.final_scene
-    after = scene.replace(contacts=()).step(run.method, (first - 1) * run.dt, run.dt)
+        flight = simulate(scene, run.method, dt=dt, steps=before, save_every=before, first_step=int(run.first_step))
+        scene = _demand(flight.final_scene)
+    after = scene.replace(contacts=()).step(run.method, (first - 1) * dt, dt)
     return bool(jnp.all(scene.finite(after.state)))
 
 
@@ -265,8 +286,8 @@ def _check_error_measure(run: Trajectory, method: Adaptive, sound: Explanation) 
     thorough = Adaptive(
         method.method, method.atol, method.atol, method.dt_min, method.dt_max, method.order, "state", None
     )
-    flight = simulate(run.scene, thorough, dt=run.dt, steps=run.steps, save_every=run.steps)
-    deviation = np.abs(np.asarray(flight.position[-1]) - np.asarray(run.final_scene.state.position))
+    flight = simulate(_read_scene(run), thorough, dt=_read_dt(run), steps=run.steps, save_every=run.steps)
+    deviation = np.abs(np.asarray(flight.position[-1]) - np.asarray(_demand(run.final_scene).state.position))
     allowed = float(method.atol) * (1 + np.abs(np.asarray(flight.position[-1])))
     if np.all(deviation <= ERROR_TOLERANCE_RATIO * allowed):
         return sound

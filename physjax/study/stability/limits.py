@@ -7,7 +7,6 @@ keeps them bounded. Beyond the limit the fastest mode grows in every step, howev
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -135,7 +134,8 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
         find = find_limits_by_rates if motion.undamped or follows_rates(module) else find_limits_by_steps
         each, find_worst_mode = find(module, motion, fastest)
         # where several blocks have the same limit, or none has one, the one that moves fastest speaks for all
-        block = np.unravel_index(np.argmax(np.where(each == each.min(), fastest, -1.0)), each.shape)
+        worst = np.argmax(np.where(each == each.min(), fastest, -1.0))
+        block = tuple(int(i) for i in np.unravel_index(worst, each.shape))
         found = attribute_mode(scene, state, motion, block, find_worst_mode(block))
         return Limit(name, float(each[block]), each, **found._asdict())
 
@@ -171,13 +171,15 @@ def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
     """
     with jax.enable_x64(True):
         rates = linearise(*prepare_linearisation(scene, at)).rates()
-        return rates.real.max(axis=-1) > DRIFT_RATE_SHARE * np.abs(rates).max(axis=-1)
+        return np.real(rates).max(axis=-1) > DRIFT_RATE_SHARE * np.abs(rates).max(axis=-1)
 
 
-def check_method(method: Callable) -> eqx.Module:
+def check_method(method: Callable) -> Callable:
     """The method as part of a compiled function; a TypeError for anything else, or a method that chooses its own steps."""
     if not callable(method):
         raise TypeError(f"stability: got the method {method!r}, expected one such as methods.rk4.")
     if isinstance(method, Adaptive):
         raise TypeError("stability: an adaptive method chooses its own steps; ask for the limit of the method inside.")
-    return as_module(method)
+    module = as_module(method)
+    assert callable(module)
+    return module

@@ -72,7 +72,8 @@ class SmallMotion(NamedTuple):
         found = np.zeros_like(scaled)
         for block in np.ndindex(scaled.shape[:-2]):
             λ, right = np.linalg.eig(scaled[block])
-            size = np.abs(λ.real) if partners else λ.real
+            growth = np.real(λ)
+            size = np.abs(growth) if partners else growth
             grows = (size > ROUNDING_RATE_SHARE * fastest_rate[block]) & (
                 np.abs(λ) > DRIFT_RATE_SHARE * fastest_rate[block]
             )
@@ -182,7 +183,8 @@ def _build_dense_matrices(scene: Scene, state: Particles, size: int) -> tuple[Ar
     unit = jnp.eye(2 * size, dtype=state.dtype).reshape((2 * size, *(1,) * len(blocks), 2 * size))
     moved, speed = jnp.split(jnp.broadcast_to(unit, (2 * size, *blocks, 2 * size)), 2, axis=-1)
     columns = jax.vmap(lambda moved, speed: _apply_stiffness_and_damping(scene, state, moved, speed))(moved, speed)
-    return tuple(jnp.moveaxis(a, 0, -1) for a in jnp.split(columns, 2))
+    stiffness, damping = (jnp.moveaxis(a, 0, -1) for a in jnp.split(columns, 2))
+    return stiffness, damping
 
 
 def sqrt_mass(scene: Scene, state: Particles) -> Array:
@@ -243,7 +245,8 @@ def follows_rates(method: Callable) -> bool:
     """
     stiffness, damping = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[0.3, -0.4], [-0.4, 1.5]])
     rate = SmallMotion(stiffness, damping, None)._rate_matrix()
-    step = np.asarray(step_matrices(method, *map(jnp.asarray, (stiffness[None], damping[None])), jnp.full(1, 0.3)))[0]
+    step = step_matrices(method, jnp.asarray(stiffness[None]), jnp.asarray(damping[None]), jnp.full(1, 0.3))
+    step = np.asarray(step)[0]
     return bool(np.abs(step @ rate - rate @ step).max() < COMMUTATOR_TOLERANCE)
 
 

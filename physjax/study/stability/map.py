@@ -83,7 +83,8 @@ def map(
     dts = np.sort(np.asarray(as_real_quantity("dts [s]", dts, above=0.0), float).ravel())
     name, values = ("", [0.0]) if parameter is None else parameter
     values = np.asarray(as_real_quantity(f"values of {name}", values), float).ravel()
-    if callable(scene) == (parameter is None):
+    build = _as_builder(scene, parameter is not None)
+    if build is None:
         raise TypeError(
             "map: got a scene and a parameter that do not fit. Give a Scene, or a function and (name, values)."
         )
@@ -91,7 +92,7 @@ def map(
         duration = DEFAULT_STEPS_PER_FRAME * JUDGED_FRAMES * dts[-1]
     duration = float(as_real_quantity("duration [s]", duration, above=0.0))
     with jax.enable_x64(True):
-        scenes = [cast_floats(scene(value) if parameter else scene, jnp.float64) for value in values]
+        scenes = [cast_floats(build(value), jnp.float64) for value in values]
         predicted = np.array([[limit(s, method).dt for s in scenes] for method in methods])
         counts = np.maximum(1, np.round(duration / JUDGED_FRAMES / dts)).astype(int)
         truths = [_sample_positions(s, ours.rk4, duration, _count_reference_steps(s, counts, duration)) for s in scenes]
@@ -102,6 +103,13 @@ def map(
     actual = np.broadcast_to(duration / JUDGED_FRAMES / counts, error.shape)
     names = tuple(method_name(method) for method in methods)
     return StabilityMap(names, name, values, actual, verdict, error, predicted, duration)
+
+
+def _as_builder(scene: Scene | Callable[[float], Scene], swept: bool) -> Callable[[float], Scene] | None:
+    """The scene as a function of the parameter; None where it is a function without one, or the other way round."""
+    if isinstance(scene, Scene):
+        return None if swept else lambda value: scene
+    return scene if swept else None
 
 
 def _count_reference_steps(scene: Scene, counts: np.ndarray, duration: float) -> int:

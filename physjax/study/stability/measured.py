@@ -18,8 +18,9 @@ from jaxtyping import Array, Float
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.particles import Particles
-from physjax.parts import Force, as_module
+from physjax.parts import Force
 from physjax.scene import Scene
+from physjax.study.stability.limits import check_method
 from physjax.study.stability.linearisation import (
     SmallMotion,
     follows_rates,
@@ -128,7 +129,7 @@ def _check_range(between: tuple[float, float], scene: Scene) -> tuple[np.ndarray
     return np.full(scene.status_shape, low), np.full(scene.status_shape, high)
 
 
-OwnGrowth = tuple[ArrayLike, ArrayLike | None]
+OwnGrowth = tuple[Array | np.ndarray, Array | np.ndarray | None]
 """The projector on motions that grow by themselves, and the basis it is written in (None: the lanes' components)."""
 
 
@@ -160,7 +161,7 @@ def _measure_deviations(
         leading = dt.shape[: dt.ndim - len(status)] if dt.ndim > len(status) else ()
         trials = np.broadcast_to(dt, (*leading, *status)).reshape((-1, *status))
         motion = linearise(scene, state)
-        method = as_module(method)
+        method = check_method(method)
         fastest_rate = jnp.asarray(_find_fastest_rate(motion))
         # without damping a method that kicks and drifts keeps the decaying partners of growing modes as well
         growth_projector = motion.growth_projector(partners=motion.undamped and not follows_rates(method))
@@ -187,8 +188,8 @@ def _run_deviations(
     push, speed = (size * jax.random.normal(key, x.shape, x.dtype) for key in keys)
     # positions and velocities in the proportion of the fastest mode: slower modes then move as well
     start = Particles(push, scale(fastest_rate, speed))
-    if scene.held is not None:
-        start = jax.tree.map(lambda leaf: scale(1 - scene.held.astype(x.dtype), leaf), start)
+    if (held := scene.held) is not None:
+        start = jax.tree.map(lambda leaf: scale(1 - held.astype(x.dtype), leaf), start)
     remove_growth = (lambda state: state) if own is None else partial(_remove_own_growth, own, scene)
     start = remove_growth(start)
     deviation = Scene(start, mass=scene.mass, forces=(_DeviationForce(scene, state),), pinned=scene.held)

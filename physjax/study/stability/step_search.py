@@ -46,10 +46,10 @@ def bounded_rates(motion: SmallMotion, method: Callable) -> np.ndarray:
     """
     rates = motion.rates()
     fastest = np.abs(rates).max(axis=-1, keepdims=True)
-    rates = np.where(np.abs(rates.real) < ROUNDING_RATE_SHARE * fastest, 1j * rates.imag, rates)
-    excluded = (np.abs(rates) < DRIFT_RATE_SHARE * fastest) | (rates.real > 0)
+    rates = np.where(np.abs(np.real(rates)) < ROUNDING_RATE_SHARE * fastest, 1j * np.imag(rates), rates)
+    excluded = (np.abs(rates) < DRIFT_RATE_SHARE * fastest) | (np.real(rates) > 0)
     if motion.undamped and not follows_rates(method):
-        excluded |= rates.real != 0
+        excluded |= np.real(rates) != 0
     return np.where(excluded, 0.0, rates)
 
 
@@ -85,7 +85,7 @@ def _find_reach(method: Callable, directions: np.ndarray) -> np.ndarray:
         good = inside(middle)
         low, high = np.where(good, middle, low), np.where(good, high, middle)
     # on the axis the growth of tiny steps is lost in rounding: an exit this early means that no step is stable
-    never = out & (unique.real == 0) & (low < AXIS_GROWTH_REACH)
+    never = out & (np.real(unique) == 0) & (low < AXIS_GROWTH_REACH)
     return np.where(out, np.where(never, 0.0, low), np.inf)[back].reshape(directions.shape)
 
 
@@ -132,8 +132,8 @@ def build_growth_filter(motion: SmallMotion) -> np.ndarray | None:
 def _build_step_matrices(method: Callable, motion: SmallMotion, dt: np.ndarray, rest: np.ndarray | None) -> np.ndarray:
     """The step's matrix of each block, within the range of the projector `rest` where there is one."""
     n = motion.stiffness.shape[-1]
-    flat = [jnp.asarray(a.reshape(-1, n, n)) for a in (motion.stiffness, motion.damping)]
-    found = step_matrices(method, *flat, jnp.asarray(np.reshape(dt, -1)))
+    stiffness, damping = (jnp.asarray(a.reshape(-1, n, n)) for a in (motion.stiffness, motion.damping))
+    found = step_matrices(method, stiffness, damping, jnp.asarray(np.reshape(dt, -1)))
     found = np.asarray(found).reshape(*motion.stiffness.shape[:-2], 2 * n, 2 * n)
     return found if rest is None else rest @ found @ rest
 
