@@ -73,6 +73,20 @@ def test_both_treatments_of_a_bounce_are_told_apart_and_belong_together():
         assert (projected["color"], projected["marker"]) == (timed["color"], timed["marker"])
         assert (timed["linestyle"], projected["linestyle"]) == ("-", "--")
         assert projected["markerfacecolor"] == "white"
+        assert projected == plot.style(f"{name}, projected")
+
+
+@pytest.mark.parametrize(
+    ("name", "keywords"),
+    [
+        ("adaptive rk4", {"adaptive": True}),
+        ("rk4, float32", {"dtype": "float32"}),
+        ("adaptive rk4, projected, float32", {"adaptive": True, "treatment": "projected", "dtype": "float32"}),
+    ],
+)
+def test_a_display_name_has_the_style_of_its_parts(name, keywords):
+    assert plot.style(name) == plot.style("rk4", **keywords) != plot.style("rk4")
+    assert plot.style(f"{name} of mine")["color"] == "0.4"
 
 
 def test_the_legend_has_room_below_the_panels():
@@ -80,10 +94,10 @@ def test_the_legend_has_room_below_the_panels():
         SCENES["tennis_ball"](), [methods.verlet], [0.01], budget=Budget(0.02, 1, 2.0), name="tennis"
     )
     runs = tuple(
-        run._replace(method=name + end)
+        run._replace(method=style.Variant(name, treatment).display_name, scheme=name, treatment=treatment)
         for run in study.runs
         for name in METHODS
-        for end in ("", style.PROJECTED_SUFFIX)
+        for treatment in (style.AS_GIVEN, style.PROJECTED)
     )
     figure = study._replace(runs=runs, promised={run.method: 1.0 for run in runs}).plot()
     figure.canvas.draw()

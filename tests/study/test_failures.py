@@ -14,15 +14,15 @@ SLOW = {"stiff_cloth", "damped_cloth"}
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in FAILURES])
 def test_the_right_cause_is_named(name):
     run = FAILURES[name]()
-    told = stability.explain(run.scene, run.method, run.dt, steps=run.steps)
-    assert (told.cause, told.force) == (run.cause, run.force)
-    assert len(told.cures) == 2
+    found = stability.explain(run.scene, run.method, run.dt, steps=run.steps)
+    assert (found.cause, found.force) == (run.cause, run.force)
+    assert len(found.cures) == 2
     if run.limit is not None:
-        assert told.limit == pytest.approx(run.limit, rel=1e-3)
-        assert told.limit < run.dt
-    if told.cause in ("stiffness", "damping") and told.limit > 0:
-        assert "times the cost" in told.cures[0]
-        cured = simulate(run.scene, run.method, dt=0.9 * told.limit, steps=2000, save_every=2000)
+        assert found.limit == pytest.approx(run.limit, rel=1e-3)
+        assert found.limit < run.dt
+    if found.cause in ("stiffness", "damping") and found.limit > 0:
+        assert "times the cost" in found.cures[0]
+        cured = simulate(run.scene, run.method, dt=0.9 * found.limit, steps=2000, save_every=2000)
         assert cured.ok.all()
     assert 20 < len(title(name)) < 120
 
@@ -54,13 +54,13 @@ def test_rk4_loses_energy_below_its_limit():
     np.testing.assert_allclose(energy[-1] / energy[0], kept, rtol=1e-6)
 
 
-def test_a_cloth_is_told_with_its_spring_and_its_node():
+def test_a_cloth_is_explained_with_its_spring_and_its_node():
     run = FAILURES["damped_cloth"]()
-    told = stability.explain(run.scene, run.method, run.dt)
-    assert told.limit == pytest.approx(float(stability.measure_limit(run.scene, run.method)), rel=0.02)
-    assert told.first_bad_step > 0
-    assert f"{told.cause} of Springs (the spring between nodes" in str(told)
-    assert f"Not finite after step {told.first_bad_step}, node {told.node[0]} first" in str(told)
+    found = stability.explain(run.scene, run.method, run.dt)
+    assert found.limit == pytest.approx(float(stability.measure_limit(run.scene, run.method)), rel=0.02)
+    assert found.first_bad_step > 0
+    assert f"{found.cause} of Springs (the spring between nodes" in str(found)
+    assert f"Not finite after step {found.first_bad_step}, node {found.node[0]} first" in str(found)
 
 
 def test_drag_turns_a_fast_body_around_within_a_step():
@@ -85,14 +85,14 @@ def test_a_throw_ends_elsewhere_when_the_error_is_blind():
 
 
 def test_a_sound_run_is_not_accused():
-    told = stability.explain(FAILURES["euler_on_a_spring"]().scene, methods.rk4, 0.01)
-    assert told.cause == "nothing"
-    assert "Nothing was found wrong" in str(told)
+    found = stability.explain(FAILURES["euler_on_a_spring"]().scene, methods.rk4, 0.01)
+    assert found.cause == "nothing"
+    assert "Nothing was found wrong" in str(found)
     with pytest.raises(ValueError, match="its method and dt"):
         stability.explain(FAILURES["euler_on_a_spring"]().scene)
 
 
-def test_one_failed_lane_of_many_is_told_by_itself():
+def test_one_failed_lane_of_many_is_explained_by_itself():
     stiffness = np.array([1.0, 9.0, 4.0e4])
     lanes = Particles(jnp.ones((3, 3)), jnp.zeros((3, 3)))
     springs = forces.Anchor((0.0, 0.0, 0.0), stiffness)  # as many lanes as components: the point is one for all
@@ -100,10 +100,10 @@ def test_one_failed_lane_of_many_is_told_by_itself():
     flight = simulate(Scene(lanes, 1.0, (springs, wind)), methods.verlet, dt=0.02, steps=600, save_every=50)
     assert flight.ok.tolist() == [True, True, False]
     failed = int(np.argmin(flight.ok))
-    told = stability.explain(flight, lane=failed)
-    assert (told.cause, told.force) == ("stiffness", "Anchor")
-    assert told.first_bad_step == flight.first_bad_step[failed]
-    assert told.limit == pytest.approx(2 / np.sqrt(stiffness[failed]), rel=1e-3)
+    found = stability.explain(flight, lane=failed)
+    assert (found.cause, found.force) == ("stiffness", "Anchor")
+    assert found.first_bad_step == flight.first_bad_step[failed]
+    assert found.limit == pytest.approx(2 / np.sqrt(stiffness[failed]), rel=1e-3)
     assert stability.explain(flight.scene, methods.verlet, 0.02, steps=600, lane=failed).cause == "stiffness"
     assert stability.explain(flight, lane=0).cause == "nothing"
     with pytest.raises(IndexError, match="whose shape is"):

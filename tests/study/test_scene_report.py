@@ -81,7 +81,7 @@ def of(name, *runs):
 
 
 def run_of(method, error, seconds):
-    return Run(method, 0.1, None, 64, 64, seconds, seconds, 0.0, error, error, ())
+    return Run(method, 0.1, None, 64, 64, seconds, seconds, 0.0, error, error, (), scheme=method)
 
 
 @pytest.mark.parametrize(
@@ -96,28 +96,30 @@ def run_of(method, error, seconds):
         ("projectile", "ablation", NO_RUN),
     ],
 )
-def test_what_cannot_be_had_says_why_in_one_sentence(name, part, reason):
-    (told,) = PARTS[part](of(name, run_of("rk4", float("nan"), 1.0)))
-    assert reason in told
-    assert told.count(". ") == 0
+def test_a_part_that_is_not_available_says_why_in_one_sentence(name, part, reason):
+    (said,) = PARTS[part](of(name, run_of("rk4", float("nan"), 1.0)))
+    assert reason in said
+    assert said.count(". ") == 0
 
 
-def test_a_touch_answered_in_a_way_of_its_own_has_no_ledger():
-    told = of("tennis_ball", run_of("rk4", 1e-9, 1.0))
-    (plane,) = told.problem.scene.contacts
+def test_a_contact_with_a_response_of_its_own_has_no_ledger():
+    studied = of("tennis_ball", run_of("rk4", 1e-9, 1.0))
+    (plane,) = studied.problem.scene.contacts
     own = replace(plane, response=lambda *moment: None, touching_since=None)
-    scene = eqx.tree_at(lambda scene: scene.contacts, told.problem.scene, (own,))
-    (reason,) = PARTS["energy ledger"](told._replace(problem=told.problem._replace(scene=scene)))
+    scene = eqx.tree_at(lambda scene: scene.contacts, studied.problem.scene, (own,))
+    (reason,) = PARTS["energy ledger"](studied._replace(problem=studied.problem._replace(scene=scene)))
     assert "a response of its own" in reason
 
 
-def test_later_parts_follow_the_cheapest_of_our_runs_that_is_true_enough():
+def test_later_parts_follow_the_cheapest_of_our_runs_that_is_accurate_enough():
     coarse, good, finer = (
         run_of("rk4", error, s) for error, s in ((3 * TARGET_ERROR, 0.1), (TARGET_ERROR, 0.2), (1e-9, 0.3))
     )
-    rival, unsteady = run_of("diffrax Tsit5", 1e-9, 0.01), run_of("midpoint", 1e-9, 0.01)
-    assert of("projectile", coarse, rival, unsteady, finer, good).run is good
+    rival, unstable = run_of("diffrax Tsit5", 1e-9, 0.01), run_of("midpoint", 1e-9, 0.01)
+    projected = good._replace(method="rk4, projected", treatment="projected", seconds=0.01)
+    adaptive = good._replace(method="adaptive rk4", adaptive=True, dt=None, seconds=0.01)
+    assert of("projectile", coarse, rival, unstable, projected, adaptive, finer, good).run is good
     assert of("projectile", coarse, rival, run_of("verlet", 0.5, 0.01)).run is coarse
-    told = of("projectile", good)
-    assert told.stepping["dt"] * 64 == told.problem.duration
-    assert told.stepping["save_every"] * told.problem.frames == 64
+    studied = of("projectile", good)
+    assert studied.stepping["dt"] * 64 == studied.problem.duration
+    assert studied.stepping["save_every"] * studied.problem.frames == 64

@@ -100,7 +100,7 @@ def test_through_contacts_the_truth_is_our_own_and_the_answer_says_so():
 
 
 @pytest.mark.slow
-def test_touches_answered_late_are_what_stops_a_small_error():
+def test_contacts_resolved_late_stop_a_small_error():
     advice = recommend(
         ball(contacts.project), error=1e-9, horizon=1.0, methods=[methods.verlet], seconds=3, progress=False
     )
@@ -141,7 +141,7 @@ def test_a_gradient_must_keep_the_error_as_well():
     assert np.abs(np.asarray(slopes.position[:, 0]) - true).max() <= 1e-5 * np.abs(true).max()
 
 
-def test_an_outcome_of_ones_own_can_be_what_counts():
+def test_an_error_can_be_that_of_a_users_outcome():
     def crossing(times, states):
         return states.position[-1, 0]
 
@@ -157,7 +157,7 @@ def test_errors_can_be_given_in_metres():
     assert relative.best.dt == pytest.approx(absolute.best.dt, rel=0.2)
 
 
-def test_what_there_was_no_time_for_is_said():
+def test_methods_without_time_are_reported():
     advice = recommend(spring(), error=1e-4, horizon=10.0, seconds=1e-3, progress=False)
     assert advice.untried
     assert f"Not tried for lack of time: {', '.join(advice.untried)}." in str(advice)
@@ -190,6 +190,7 @@ def test_the_error_of_each_norm_is_what_it_says():
         ({"error": [[1e-2]]}, "expected a number or a list"),
         ({"horizon": -1.0}, "horizon"),
         ({"norm": 3}, "norm: got 3"),
+        ({"dtype": np.float32}, "unknown recommend: option .dtype.. Did you mean dtypes"),
         ({"norm": accuracy.penetration}, "no contacts"),
     ],
 )
@@ -249,7 +250,7 @@ def test_dry_friction_is_walked_through_and_never_called_chaos():
 
 
 @pytest.mark.slow
-def test_what_is_as_far_off_from_a_smaller_nudge_has_not_grown():
+def test_a_deviation_that_a_smaller_nudge_leaves_as_large_is_no_growth():
     with jax.enable_x64(True):
         truth = solve_reference(Problem(spring(), 4.0, frames=8))
     noise = jax.tree.map(lambda leaf: leaf * (1 + np.linspace(0.0, 1.0, 9)[:, None] ** 9), truth.states)

@@ -3,12 +3,13 @@
 import csv
 from dataclasses import replace
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, contacts, forces, lattices, methods, springs
+from physjax import Particles, Pins, Scene, contacts, emitters, forces, inertia, lattices, methods, rigid, springs
 from physjax.scene import as_module
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
@@ -16,6 +17,7 @@ from physjax.stepping.simulate import sample_states
 from physjax.study import accuracy
 from physjax.study.accuracy import Budget, work_precision
 from physjax.study.accuracy.compiled_run import compile_run, stack_copies
+from physjax.study.problem import Problem
 from physjax.text import format_seconds
 
 FEW = Budget(seconds=0.02, repeats=1, refinement=2.0)
@@ -106,7 +108,7 @@ def test_float32_shows_its_rounding():
     assert 1e-7 < swing32.runs[0].path_error < 1e-3
 
 
-def test_a_method_of_ones_own_is_counted_and_unpromised():
+def test_a_users_method_is_counted_and_unpromised():
     def heun(system, t, state, dt):
         first = system.rate(t, state)
         ahead = system.drift(system.kick(state, first, dt), dt)
@@ -143,6 +145,7 @@ def test_the_fastest_run_keeps_its_error(swing):
         ({"duration": -1.0}, "duration"),
         ({"duration": 1.0, "dts": [0.1, -0.1]}, "dts"),
         ({"duration": 1.0, "dts": [0.1, np.nan]}, "dts"),
+        ({"duration": 1.0, "batches": 3}, "unknown work_precision: option .batches.. Did you mean batch"),
     ],
 )
 @pytest.mark.usefixtures("unannotated")
@@ -163,13 +166,14 @@ def test_diffrax_is_no_rival_where_it_would_fall_through_the_floor():
 
     study = work_precision(ball, [methods.verlet], [1e-3, 1e-4], duration=1.0, exact=exact, budget=FEW)
     assert study.methods == ("verlet", "verlet, projected")
+    assert {(run.scheme, run.treatment) for run in study.runs} == {("verlet", "as given"), ("verlet", "projected")}
     assert study.of("verlet")[-1].path_error < 1e-12
     assert 1e-6 < study.of("verlet, projected")[-1].path_error < 2e-3
     with pytest.raises(ValueError, match="has contacts"):
         work_precision(ball, [methods.verlet], [1e-3], duration=1.0, exact=exact, rivals=accuracy.default_rivals())
 
 
-def test_where_a_bounce_is_answered_decides_the_order():
+def test_when_a_bounce_is_resolved_decides_the_order():
     """Forty-eight drop heights with drag: timed, a method keeps its order; at the end of the step, all are first order."""
     dts = 2.0 / 32 / 2.0 ** np.arange(11)
     study = work_precision(SCENES["bouncing_ball"](), [methods.verlet, methods.rk4], dts, budget=FEW)
@@ -221,6 +225,8 @@ def test_float_types_and_adaptive_methods_stand_side_by_side(both_kinds):
     names = ("verlet", "verlet, float32", "adaptive rk4", "adaptive rk4, float32")
     assert both_kinds.methods == names
     assert {run.dtype for run in both_kinds.of("verlet, float32")} == {"float32"}
+    assert {(run.scheme, run.adaptive) for run in both_kinds.runs} == {("verlet", False), ("rk4", True)}
+    assert {run.treatment for run in both_kinds.runs} == {"as given"}
     assert both_kinds.observed_order("verlet") == pytest.approx(2, abs=0.15)
     runs = both_kinds.of("adaptive rk4")
     assert [run.tolerance for run in runs] == [1e-3, 1e-5, 1e-7]
@@ -328,11 +334,69 @@ def test_copies_remember_each_on_its_own(build):
     np.testing.assert_allclose(many.position[:, 2], one.position, rtol=1e-12, atol=1e-12)
 
 
+def fountain():
+    """An emitter, whose slots are the one axis of its lanes."""
+    spray = emitters.Emitter(8, emitters.Point((0.0, 0.0)), key=0, life=1.0, speed=5.0, rate=7.0, cone=0.3)
+    return Scene(spray.unborn(), forces=(forces.Gravity(),), emitter=spray)
+
+
+def loaded_pair():
+    """Two masses on a spring, and a plain function that names its lanes and holds an array of them."""
+    pull = jnp.asarray([[0.0, -1.0], [0.5, 0.0]])
+    spring = springs.Springs([[0, 1]], stiffness=10.0, rest_length=1.0)
+    load = lambda t, s, m: pull * t + (s.position[::-1] - s.position)  # noqa: E731
+    return Scene(Particles(jnp.asarray([[0.0, 0.0], [1.2, 0.0]]), jnp.zeros((2, 2))), forces=(spring, load))
+
+
+def shaken_rope():
+    """Springs, a pinned node that is led along a path, and a drag per node."""
+    rope = lattices.rope((0.0, 0.0), (1.0, 0.0), 4, mass=1.0, stiffness=100.0)
+    hand = Pins(jnp.arange(4) == 0, path=lambda t: rope.state.position + jnp.array([[0.0, 1.0]]) * t)
+    drag = forces.StokesDrag(jnp.array([0.1, 0.2, 0.3, 0.4]))
+    return Scene(hand.prescribe(0.0, rope.state), rope.mass, (rope.springs, drag), pinned=hand)
+
+
+def spinning_body():
+    """A body under its weight, over a plane."""
+    brick = inertia.box(2.0, (1.0, 2.0, 3.0))
+    return Scene(rigid.bodies(brick, jnp.zeros((2, 3)), angular_velocity=(1.0, 2.0, 3.0)), brick, (forces.Gravity(),))
+
+
+@pytest.mark.parametrize("build", [fountain, loaded_pair, shaken_rope, spinning_body, ball_on_a_floor])
+def test_every_copy_of_a_batch_moves_as_the_scene_alone(build):
+    problem = Problem(build(), 0.6, frames=4)
+    with jax.enable_x64(True):
+        one, many = (compile_run(problem, methods.verlet, copies=copies)(8.0) for copies in (1, 3))
+    for alone, batch in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
+        assert batch.shape == (alone.shape[0], 3, *alone.shape[1:])
+        for copy in range(3):
+            np.testing.assert_allclose(batch[:, copy], alone, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("build", "rivals"),
+    [(loaded_pair, (diffrax.Tsit5(),)), pytest.param(fountain, (), marks=pytest.mark.slow)],
+)
+def test_a_batch_of_a_scene_that_cannot_be_stacked_is_timed(build, rivals):
+    options = accuracy.Options(batch=5, rivals=rivals, tolerances=(1e-3,))
+    study = work_precision(build(), [methods.euler], [0.02], duration=0.4, budget=FEW, options=options)
+    assert all(run.seconds > 0 and np.isfinite(run.path_error) for run in study.runs)
+    assert study.batch == 5
+
+
+def test_keywords_come_before_the_options():
+    options = accuracy.Options(name="spring", dtype=np.float32, rivals=())
+    spring = Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(forces.Anchor((0.0,), 9.0),))
+    few = {"duration": 1.0, "budget": FEW, "options": options}
+    study = work_precision(spring, [methods.verlet], [0.1], name="other", **few)
+    assert (study.name, study.methods) == ("other", ("verlet, float32",))
+
+
 def test_rivals_can_be_chosen():
     assert [type(solver).__name__ for solver in accuracy.default_rivals()] == ["Tsit5", "Dopri8"]
 
 
-def test_chaos_is_found_beyond_where_two_neighbours_have_parted():
+def test_chaos_is_found_beyond_where_neighbouring_paths_have_separated():
     place = Particles(jnp.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), jnp.zeros((3, 2)))
     rods = springs.Springs([[0, 1], [1, 2]], stiffness=500.0, rest_length=1.0)
     double = Scene(place, pinned=jnp.array([True, False, False]), forces=(forces.Gravity(), rods))
