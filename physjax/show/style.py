@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, Required, TypedDict
 from physjax.stepping.methods import METHODS
 
 PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
-"""Okabe and Ito's colours, told apart by colour-blind readers too; two more for methods to come."""
+"""Okabe and Ito's colours, which colour-blind readers distinguish too; two more for methods to come."""
 MARKERS = "osD^vPX*"
 Dashes = Literal["-", "--", "-.", ":"]
 RIVAL_STYLES: dict[str, tuple[str, Dashes]] = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}

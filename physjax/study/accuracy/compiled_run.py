@@ -92,7 +92,7 @@ def compile_run(
 ) -> CompiledRun:
     """Compile a method for a problem; inside `jax.enable_x64(True)`.
 
-    `push`, a change of the start, is carried along by forward differentiation. With `copies` the run is one of so many
+    `push`, a change of the start, is carried along by forward differentiation. With `copies` the run is one of that many
     scenes at once. `treatment` names what has been done to the scene's contacts.
     """
     scene, copied = cast_floats(problem.scene, dtype), None

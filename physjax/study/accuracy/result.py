@@ -20,9 +20,9 @@ TABLE_ERRORS = (1e-2, 1e-4, 1e-6)
 
 
 MAX_EXACT_FLOOR = 1e-10
-"""A truth whose own error is larger than this, in parts of the path, cannot say of a run that it is exact."""
+"""A truth whose own error is larger than this, relative to the path, cannot say of a run that it is exact."""
 LARGEST_FITTED_ERROR = 0.05
-"""Error, in parts of the path, above which a run is too coarse to show its order."""
+"""Error, relative to the path, above which a run is too coarse to show its order."""
 FITTED_STEPS_RATIO = 8.0
 """Steps up to this many times the finest are fitted: coarser ones still bend."""
 LEAST_SCATTERED_FALL = 10.0

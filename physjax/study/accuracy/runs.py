@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 MAX_STEPS_PER_FRAME = 10**8
 """Steps between two moments beyond which no budget reaches."""
 ROUNDING_ERRORS = {"float64": 1e-7, "float32": 1e-3}
-"""Errors below which refinements that bring nothing are put down to rounding, in parts of the path."""
+"""Errors below which refinements that bring nothing are put down to rounding, relative to the path."""
 STALLED_ERROR_RATIO = 0.9
 """A refinement that leaves more than this share of the error has brought nothing."""
 EVALUATIONS_PER_TRIED_STEP = 3

@@ -27,11 +27,11 @@ MAX_FINENESS = 1e12
 CLOSE_STEP_RATIO = 1.15
 """A step within this factor of the longest that would do is as good."""
 TURN_SECONDS, MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS, MIN_TIMING_SECONDS = 1e-3, 7, 1000, 0.3
-"""Finalists take turns of this length [s], at least so many rounds and so long [s]: what disturbs the machine comes in bursts."""
+"""Finalists take turns of this length [s], for at least this many rounds and this long [s]: what disturbs the machine comes in bursts."""
 GRACE_SECONDS = 5.0
 """Beyond the deadline nothing is compiled; short runs may still decide between finalists for this long [s]."""
 ROUNDING_ERROR, COARSE_ERROR = 1e-13, 0.3
-"""Between these errors, in parts of the path, two runs show with which power of fineness errors fall."""
+"""Between these errors, relative to the path, two runs show with which power of fineness errors fall."""
 ERROR_MARGIN, INTERPOLATED_ERROR_MARGIN = 0.9, 0.93
 """Shares of an error aimed at, so that the first guess keeps it: beyond the runs known, and between two of them."""
 MAX_REFINEMENTS = 6

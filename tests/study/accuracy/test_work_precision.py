@@ -262,7 +262,7 @@ def test_nothing_beats_the_front(both_kinds):
 
 
 def test_chaos_is_marked_where_rounding_has_grown():
-    """Three bodies from rest (Burrau's problem): in float32 the path is lost, an oscillator's is not."""
+    """Three bodies from rest (Burrau's problem): in float32 rounding decides the path, an oscillator's is not."""
     place = jnp.asarray([[1.0, 3.0], [-2.0, -1.0], [1.0, -1.0]])
     attraction = forces.Gravitation(G=1.0, softening=0.02)
     bodies = Scene(Particles(place, jnp.zeros_like(place)), mass=jnp.asarray([3.0, 4.0, 5.0]), forces=(attraction,))
@@ -349,7 +349,7 @@ def loaded_pair():
 
 
 def shaken_rope():
-    """Springs, a pinned node that is led along a path, and a drag per node."""
+    """Springs, a node with prescribed motion, and a drag per node."""
     rope = lattices.rope((0.0, 0.0), (1.0, 0.0), 4, mass=1.0, stiffness=100.0)
     hand = Pins(jnp.arange(4) == 0, path=lambda t: rope.state.position + jnp.array([[0.0, 1.0]]) * t)
     drag = forces.StokesDrag(jnp.array([0.1, 0.2, 0.3, 0.4]))

@@ -115,7 +115,7 @@ def test_the_limit_of_a_cloth_of_a_thousand_nodes_is_the_measured_one(name, damp
 
 @pytest.mark.parametrize("damping", [pytest.param(None, marks=pytest.mark.slow), 10.0], ids=["undamped", "damped"])
 def test_what_sets_the_limit_of_a_cloth_is_its_stiffness_or_its_damping(damping):
-    cloth = sheet(12, damping)  # of so many coordinates only the fastest modes are sought
+    cloth = sheet(12, damping)  # of this many coordinates only the fastest modes are sought
     predicted = stability.limit(cloth, methods.semi_implicit_euler)
     assert predicted.dt == pytest.approx(6.3e-3 if damping is None else 1.8e-3, rel=0.05)
     assert (predicted.cause, predicted.force) == ("stiffness" if damping is None else "damping", "Springs")
