@@ -40,8 +40,12 @@ class OldName:
 
 
 def _find_owner(cls: type, name: str) -> int:
-    """The place in the order of method resolution of the class that defines a name; behind all if none does."""
-    owners = (place for place, base in enumerate(cls.__mro__) if name in vars(base))
+    """The place in the order of method resolution of the class that defines a name; behind all if none does.
+
+    An alias made here is no definition.
+    """
+    defined = (vars(base).get(name) for base in cls.__mro__)
+    owners = (place for place, value in enumerate(defined) if value is not None and not isinstance(value, OldName))
     return next(owners, len(cls.__mro__))
 
 
@@ -54,10 +58,12 @@ def _bind_new_name(cls: type, old: str, new: str, value: Any) -> None:
     else:
         bound = _read_attribute(old)
     setattr(cls, new, bound)
-    warnings.warn(
+    file, line = _find_line_in(cls.__module__)
+    warnings.warn_explicit(
         f"{cls.__name__}: got the method {old}, which is now called {new}. It works as before; rename it to {new}.",
         FutureWarning,
-        stacklevel=_count_frames_to(cls.__module__),
+        file,
+        line,
     )
 
 
@@ -70,9 +76,9 @@ def _read_attribute(name: str) -> property:
     return property(read)
 
 
-def _count_frames_to(module: str) -> int:
-    """How far up the stack, seen from the caller, the module is that defines a class: metaclasses stand between."""
-    frame, count = sys._getframe(1), 1
-    while frame is not None and frame.f_globals.get("__name__") != module:
-        frame, count = frame.f_back, count + 1
-    return count if frame is not None else 1
+def _find_line_in(module: str) -> tuple[str, int]:
+    """File and line where the module is that defines a class, up the stack: metaclasses and type checkers stand between."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__") != module:
+        frame = frame.f_back
+    return frame.f_code.co_filename, frame.f_lineno

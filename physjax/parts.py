@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.checks import demand_start_outside
 from physjax.loops import Time
+from physjax.old_names import serve_old_names
 from physjax.particles import Particles, demand_particles
 from physjax.vectors import scale
 
@@ -40,6 +41,15 @@ def find_plain_functions(part: Any) -> list[Function]:
     return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
 
 
+FORCE_OLD_NAMES = {
+    "during": "averaged_over_step",
+    "near": "linearised_at",
+    "definite": "dissipative_symmetric",
+}
+CONTACT_OLD_NAMES = {"gap": "signed_distance", "answered": "resolve", "forgetting": "forget_lanes", "prepared": "prepare"}
+"""What abilities were called in the first edition."""
+
+
 class Force(eqx.Module):
     """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
 
@@ -64,6 +74,10 @@ class Force(eqx.Module):
     """Whether its Jacobian is symmetric and takes energy, as that of springs: implicit steps then use conjugate gradients."""
     sees_moments: ClassVar[bool] = False
     """Whether it takes the time as a `Moment`, which keeps what one float32 cannot hold."""
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        serve_old_names(cls, FORCE_OLD_NAMES)
 
     @abstractmethod
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
@@ -125,6 +139,9 @@ class Force(eqx.Module):
         return self
 
 
+serve_old_names(Force, FORCE_OLD_NAMES)
+
+
 class Field(Force):
     """A force proportional to mass, given as an acceleration [m/s²], so that a falling body never looks its mass up.
 
@@ -163,6 +180,10 @@ class Contact(eqx.Module):
     response: ClassVar[Callable | None] = None
     memory: ClassVar[tuple[str, ...]] = ()
 
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        serve_old_names(cls, CONTACT_OLD_NAMES)
+
     @abstractmethod
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Signed distance to the surface [m], > 0 on the legal side."""
@@ -199,6 +220,9 @@ def build_memory_mask(part: Any) -> Any:
     if part is None or not part.memory:
         return mask
     return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
+
+
+serve_old_names(Contact, CONTACT_OLD_NAMES)
 
 
 def has_memory(part: Any) -> bool:

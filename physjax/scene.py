@@ -300,6 +300,9 @@ class Scene(eqx.Module):
         where = lambda scene: [getattr(scene, name) for name in names]  # noqa: E731
         return eqx.tree_at(where, self, list(parts.values()), is_leaf=lambda leaf: leaf is None)
 
+    having = replace
+    """The name of the first edition."""
+
     def finite(self, state: Any) -> Bool[Array, "..."]:
         """Whether the state is finite, per lane, or per scene where lanes are coupled."""
         status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
