@@ -23,7 +23,7 @@ def _run_stability(name: str, out: str, steps: int) -> None:
 
     from physjax.checks import as_positive_integer, demand_known
     from physjax.files import ensure_writable_folder, write_atomically
-    from physjax.parts import callable_name
+    from physjax.particles import callable_name
     from physjax.scenes import FAILURES, SCENES
     from physjax.stepping.methods import METHODS
     from physjax.study import stability

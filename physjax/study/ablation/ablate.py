@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import as_real_quantity
-from physjax.parts import callable_name
+from physjax.particles import callable_name
 from physjax.scene import Scene
 from physjax.stepping.simulate import simulate
 from physjax.study.ablation.variants import Variant, list_pair_variants, list_variants

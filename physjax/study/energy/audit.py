@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.loops import Moment, Time, moment_at, to_float_time
-from physjax.parts import callable_name
+from physjax.particles import callable_name
 from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
 from physjax.physics.rigid.response import collide, fold_body_flights
 from physjax.scene import Scene, free_motion, project
