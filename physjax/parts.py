@@ -1,4 +1,4 @@
-"""The parts of a scene: what a force and a contact are, and what becomes of them when a scene is built."""
+"""The parts of a scene: what a force and a contact can do, and how they are prepared when a scene is built."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -20,7 +20,7 @@ from physjax.vectors import scale
 
 
 class Function(eqx.Module):
-    """A plain function as part of a scene. It counts as coupling its lanes unless it is said to be independent."""
+    """A plain function as part of a scene. It counts as coupling lanes unless `forces.independent` says otherwise."""
 
     function: Callable = eqx.field(static=True)
     couples: bool = eqx.field(static=True, default=True)
@@ -36,7 +36,7 @@ def as_module(function: Callable) -> PyTree:
 
 
 def find_plain_functions(part: PyTree) -> list[Function]:
-    """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
+    """The plain functions in a part of a scene or a method, however deep. What they close over cannot be seen."""
     is_plain = lambda node: isinstance(node, Function)  # noqa: E731
     return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
 
@@ -59,8 +59,8 @@ class Force(eqx.Module):
     """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
 
     `t` [s] is a scalar or one per lane. `couples` says whether a lane's force depends on other lanes. Numbers are fields
-    made with `quantity`. Everything below `__call__` is an ability that a force may have, with the default of one that
-    has it not: a conservative force gives its `potential`, one that jumps in time its mean (`averaged_over_step`) and its
+    made with `quantity`. Everything below `__call__` is an ability that a force may have, with the default of a force
+    that lacks it: a conservative force gives its `potential`, one that jumps in time its mean (`averaged_over_step`) and its
     `discontinuities`, one with memory how it `advance`s, one that depends on g or on which axis is up asks the scene
     (`under`).
 
@@ -170,9 +170,9 @@ class Field(Force):
 
 
 class Contact(eqx.Module):
-    """Something that lanes may not pass. `respond(t, state)` answers every touch, once a step, at its end.
+    """Something that lanes may not pass. `respond(t, state)` resolves every contact at the end of a step.
 
-    A `response(motion, scene, t, dt) -> scene` other than `project` decides otherwise when touches are answered;
+    A `response(motion, scene, t, dt) -> scene` other than `project` decides when contacts are resolved instead;
     `memory` names the arrays that it changes.
 
     Example:
@@ -195,23 +195,23 @@ class Contact(eqx.Module):
 
     @abstractmethod
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
-        """The state after a touch; lanes that touch nothing stay as they are."""
+        """The state after contact; lanes that are not in contact stay as they are."""
 
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
-        """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
+        """The contact with the memory of some lanes cleared, because other particles take their place."""
         return self
 
     def resolve(self, t: ArrayLike, state: PyTree, mass: PyTree) -> PyTree:
-        """What `project` takes: `respond`, unless an answer needs the masses."""
+        """What `project` calls: `respond`, unless the response needs the masses."""
         return self.respond(t, state)
 
     def clearance(self, t: ArrayLike, state: PyTree) -> Float[Array, "*lanes"]:
-        """How far each lane is from touching [m]."""
+        """How far each lane is from contact [m]."""
         return self.signed_distance(t, state.position)
 
     def demand_fit(self, state: PyTree, mass: PyTree) -> None:
-        """Raise a TypeError for what cannot touch it, and a ValueError for lanes that start on the wrong side."""
-        demand_particles("contacts", state, "rigid bodies touch with rigid.Touch(hull, plane)")
+        """Raise a TypeError for a state that cannot be in contact with it, a ValueError for lanes that start on the wrong side."""
+        demand_particles("contacts", state, "rigid bodies need rigid.SurfaceContact(hull, plane)")
         demand_start_outside(self, state)
 
     def prepare(self, state: PyTree, couples: bool) -> "Contact":
@@ -267,14 +267,14 @@ def build_advance_mask(force: Force, state: PyTree, mass: PyTree) -> PyTree:
 @cache
 def _adopt_class(cls: type) -> type:
     """The class of a user's force that is not derived from `Force`, with the defaults of `Force` for what it lacks."""
-    own = {} if hasattr(cls, "couples") else {"couples": True}  # what does not say may look at any lane
+    own = {} if hasattr(cls, "couples") else {"couples": True}  # one that does not say may depend on any lane
     names = {"__module__": cls.__module__, "__qualname__": cls.__qualname__, "__doc__": cls.__doc__}
     # with its own way to begin: a dataclass would make one in which a default of `Force` may stand before a field without one
     return type(cls)(cls.__name__, (cls, Force), own | names | {"__init__": cls.__init__})
 
 
 def adopt_force(part: Callable) -> Force:
-    """Any callable as a `Force`: a plain function, or a module of the user's own with some of the abilities of one."""
+    """Any callable as a `Force`: a plain function, or a user's module with some of its abilities."""
     module = as_module(part)
     if isinstance(module, Force):
         return module
@@ -284,7 +284,7 @@ def adopt_force(part: Callable) -> Force:
 
 
 def unify_gravity(forces: list, dim: int) -> tuple:
-    """The forces, agreed about g and which axis of `dim` is up: those of `Gravity`, of several the sum."""
+    """The forces with one g and one axis of `dim` that is up: those of `Gravity`, with several of them the sum."""
     weights = [force.weight for force in forces if force.weight is not None]
     for _, up in weights:
         if up >= dim:

@@ -1,8 +1,8 @@
 """What every number of a scene's parts is: declared where the part is defined, and held against the lanes here.
 
 `quantity` (checks.py) says of a field what it is and what there is one of it for. Here the declarations are found, however
-deep a part is nested, and answer for all: whether a number fits the lanes, which arrays have an entry for each lane
-(and can be cut with them), and which lanes a traced number beyond its bounds spoils. Nothing is guessed from a shape:
+deep a part is nested, and decide everything: whether a number fits the lanes, which arrays have an entry for each lane
+(and are cut with them), and which lanes a traced number beyond its bounds invalidates. Nothing is guessed from a shape:
 what a part does not declare is shared by all lanes.
 """
 

@@ -47,10 +47,10 @@ from physjax.quantities import build_lane_mask, demand_fitting_numbers, mark_inv
 
 
 def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
-    """The lecture's response: step as if nothing were there, then put back and turn around what went in.
+    """The lecture's response: step as if nothing were there, then move back and reflect what is inside.
 
-    Cheap and robust, first order in dt: a bounce happens at the end of the step, not when the surface was met, and a
-    lane that crosses a thin obstacle within one step is not seen.
+    Cheap and robust, first order in dt: a bounce happens at the end of the step, not at the time of impact, and a
+    lane that crosses a thin obstacle within one step is missed.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.project)
@@ -68,12 +68,12 @@ def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene"
 
 
 class Scene(eqx.Module):
-    """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held or led, or born.
+    """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held, prescribed or born.
 
     `mass` is a scalar or per lane, an `Inertia` for rigid bodies. `forces` are library forces or any callable
     `(t, state, mass) -> newtons`. `pinned` is a boolean mask over the lanes that are held, or `Pins(nodes, path)`, which
-    leads them. With an `emitter` the lanes are born and die. Every number becomes an array of the state's dtype:
-    changing it compiles nothing, and it can be swept and differentiated. Raises ValueError or TypeError for shapes that
+    prescribes their motion. With an `emitter` the lanes are born and die. Every number becomes an array of the state's dtype:
+    changing it does not recompile, and it can be swept and differentiated. Raises ValueError or TypeError for shapes that
     do not match, numbers that are not finite, and masses <= 0.
 
     Example:
@@ -153,7 +153,7 @@ class Scene(eqx.Module):
 
     @property
     def compiles_in_pieces(self) -> bool:
-        """Whether a step is compiled in pieces: where more than a few nodes look at each other."""
+        """Whether a step is compiled in pieces, as it is where more than a few nodes are coupled."""
         return self.couples and self.state.lanes[-1:] > (SINGLE_PIECE_NODES,)
 
     def may_be_cut(self) -> bool:
@@ -207,7 +207,7 @@ class Scene(eqx.Module):
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.compiles_in_pieces:
             return state.rate(state.generalised_force(self, t), self.mass)
-        # apart, or a method's stage would be computed anew in every neighbour that looks at it
+        # materialised, or XLA would recompute a stage in every neighbour that reads it
         return state.rate(materialise(to_float_time(t), lambda: state.generalised_force(self, t)), self.mass)
 
     def kick(self, state: PyTree, rate: PyTree, dt: ArrayLike) -> PyTree:
@@ -343,7 +343,7 @@ def _advance_force(index: int, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Sce
 
 
 def trace_once(response: Callable) -> Callable:
-    """A response traced once for all who step the same scene: a search with derivatives steps it in many places."""
+    """A response traced once for all callers that step the same scene: a search with derivatives does so in many places."""
     program = jax.jit(response)
 
     @wraps(response)

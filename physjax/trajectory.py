@@ -26,7 +26,7 @@ class Trajectory(eqx.Module):
 
     `.ok` says whether the state stayed finite, per lane (per scene where lanes are coupled); `.first_bad_step` where it
     did not. `.parts` are the forces, contacts and emitter that remember, with the arrays they changed at every frame.
-    `.recorded` replaces `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of
+    `.recorded` replaces `.state` when `simulate` was given a `record`. `.final_scene` is the scene at the end of
     the run, from which it can be resumed.
 
     Example:
@@ -220,7 +220,7 @@ class Trajectory(eqx.Module):
     def _demand_states(self) -> PyTree:
         if self.state is None:
             raise AttributeError(
-                "this trajectory holds .recorded only: simulate was told what to record instead of the state."
+                "this trajectory holds .recorded only: simulate was given record=, which replaces the state."
             )
         return self.state
 
@@ -242,7 +242,7 @@ def _find_first_bad_step(scene, method, dt, first_step, steps):
 
 
 def select_stateful_parts(scene: Scene) -> tuple:
-    """The parts of the scene with memory: forces that advance, contacts that know who touches them, an emitter."""
+    """The parts of the scene with memory: forces that advance, contacts that remember since when lanes touch them, an emitter."""
     return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if has_memory(part))
 
 
