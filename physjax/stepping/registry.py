@@ -46,11 +46,6 @@ def promises(
     return attach
 
 
-def method_name(method: Callable) -> str:
-    """What a method is called in tables."""
-    return getattr(method, "__name__", None) or type(method).__name__
-
-
 @runtime_checkable
 class Promising(Protocol):
     """A method that makes promises; a user's own function need not."""

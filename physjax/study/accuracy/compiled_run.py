@@ -20,7 +20,7 @@ from physjax.scene import Scene
 from physjax.show.style import AS_GIVEN, PROJECTED, Variant
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.reference import cast_floats
-from physjax.stepping.simulate import find_changing_parts, sample_states
+from physjax.stepping.simulate import sample_states
 from physjax.study.accuracy.method_facts import depends_on_velocity, describe_method, promised_order, smallest_size
 from physjax.study.problem import Problem
 
@@ -177,7 +177,7 @@ def map_copies(function: Callable[[Scene], PyTree], scene: Scene, copied: tuple[
 
 def _find_copied_arrays(scene: Scene) -> Scene:
     """The scene with True in place of each array that every copy has for itself, False elsewhere."""
-    changing = find_changing_parts(scene, jnp.ones((), scene.state.dtype))
+    changing = scene.changing()
 
     def mark(part, changes, per_lane):
         # without a lane axis the copies share numbers; so they do where a part ties lanes together, such as springs,

@@ -9,19 +9,20 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from physjax.particles import callable_name
 from physjax.parts import Function
 from physjax.scene import Scene
 from physjax.show.style import Variant
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.reference import cast_floats
-from physjax.stepping.registry import method_name, read_promises
+from physjax.stepping.registry import read_promises
 
 
 def describe_method(method: Callable) -> Variant:
     """A method's name, and whether it chooses its own steps: then it is named after the method that it subdivides."""
     if not isinstance(method, Adaptive):
-        return Variant(method_name(method))
-    return Variant(method_name(subdivided_method(method)), adaptive=True)
+        return Variant(callable_name(method))
+    return Variant(callable_name(subdivided_method(method)), adaptive=True)
 
 
 def method_title(method: Callable) -> str:

@@ -27,7 +27,7 @@ MAX_FINENESS = 1e12
 CLOSE_STEP_RATIO = 1.15
 """A step within this factor of the longest that would do is as good."""
 TURN_SECONDS, MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS, MIN_TIMING_SECONDS = 1e-3, 7, 1000, 0.3
-"""Finalists take turns of this length [s], for at least this many rounds and this long [s]: what disturbs the machine comes in bursts."""
+"""Finalists take turns of this length [s], for at least this many rounds and seconds: disturbances come in bursts."""
 GRACE_SECONDS = 5.0
 """Beyond the deadline nothing is compiled; short runs may still decide between finalists for this long [s]."""
 ROUNDING_ERROR, COARSE_ERROR = 1e-13, 0.3

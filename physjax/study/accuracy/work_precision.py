@@ -163,9 +163,7 @@ def _as_problem(
     return Problem(problem, float(duration), exact, tuple(conserved))
 
 
-def _check_rivals(
-    problem: Problem, rivals: "Sequence[diffrax.AbstractERK] | None"
-) -> "Sequence[diffrax.AbstractERK]":
+def _check_rivals(problem: Problem, rivals: "Sequence[diffrax.AbstractERK] | None") -> "Sequence[diffrax.AbstractERK]":
     if rivals is None:
         return default_rivals() if problem.is_ode else ()
     if rivals and not problem.is_ode:

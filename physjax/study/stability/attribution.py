@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from physjax.particles import Particles
-from physjax.parts import Force, force_name
+from physjax.particles import Particles, callable_name
+from physjax.parts import Force
 from physjax.physics.springs.springs import Springs
 from physjax.scene import Scene
 from physjax.study.stability.linearisation import SmallMotion
@@ -43,7 +43,7 @@ def attribute_mode(
     size = np.sum(np.abs(moved) ** 2, axis=-1)
     node = tuple(int(i) for i in np.unravel_index(np.argmax(size), size.shape))
     spring = _find_worst_spring(force, state, moved, kind, block) if isinstance(force, Springs) else None
-    return Attribution(("stiffness", "damping")[kind], force_name(force), spring, node, complex(rate))
+    return Attribution(("stiffness", "damping")[kind], callable_name(force), spring, node, complex(rate))
 
 
 @jax.jit

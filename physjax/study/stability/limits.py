@@ -13,11 +13,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.checks import as_real_quantity
-from physjax.particles import Particles
+from physjax.particles import Particles, callable_name
 from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
-from physjax.stepping.registry import method_name
 from physjax.study.stability.attribution import attribute_mode
 from physjax.study.stability.linearisation import (
     DRIFT_RATE_SHARE,
@@ -110,7 +109,7 @@ def region(
     """
     with jax.enable_x64(True):
         z = np.linspace(*real, points[0]) + 1j * np.linspace(*imaginary, points[1])[:, None]
-        return Region(method_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
+        return Region(callable_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
 
 
 def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
@@ -126,7 +125,7 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
     """
     with jax.enable_x64(True):
         scene, state = prepare_linearisation(scene, at)
-        module, name = check_method(method), method_name(method)
+        module, name = check_method(method), callable_name(method)
         motion = linearise(scene, state)
         fastest = np.abs(motion.rates()).max(axis=-1)
         if not np.any(fastest > 0):
