@@ -181,7 +181,8 @@ def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractERK
     if comparison.batch > 1:
         timed = partial(_solve_copies, stack_copies(scene, comparison.batch), find_mapped_arrays(scene))
     # first same as last: the last stage of a step is the first of the next
-    stages = solver.tableau.num_stages - (1 if solver.tableau.fsal else 0)
+    tableau = solver.tableau  # of an explicit solver there is one
+    stages = tableau.num_stages - (1 if tableau.fsal else 0)  # pyright: ignore[reportAttributeAccessIssue]  see above
     name, dtype = f"diffrax {type(solver).__name__}", np.dtype(scene.state.dtype).name
     runs: list[Run] = []
     for tol in comparison.tolerances:

@@ -165,7 +165,7 @@ def _describe_sound_run(run: Trajectory, first: int, node: tuple[int, ...]) -> E
 
 def _check_rates(run: Trajectory, sound: Explanation) -> Explanation:
     """Whether the step exceeds a limit at a moment of the run, or is too long to follow the fastest motion."""
-    scene, method, step = _read_scene(run), run.method, sound.dt
+    scene, method, step = _read_scene(run), _read_method(run), sound.dt
     found = [(t, limit(scene, method, at=state), state) for t, state in _pick_moments(run, scene)]
     exceeded = [moment for moment in found if step > moment[1].dt * (1 + LIMIT_TOLERANCE)]
     if exceeded:
@@ -198,6 +198,13 @@ def _demand(scene: Scene | None) -> Scene:
 def _read_scene(run: Trajectory) -> Scene:
     """The scene that a run began with; a TypeError for a run without one."""
     return _demand(run.scene)
+
+
+def _read_method(run: Trajectory) -> Callable:
+    """The method of a run; a TypeError for a run without one."""
+    if run.method is None:
+        raise TypeError(_INCOMPLETE_RUN)
+    return run.method
 
 
 def _read_dt(run: Trajectory) -> Array | np.ndarray:
@@ -239,7 +246,7 @@ def _find_first_failure(run: Trajectory) -> tuple[int, tuple[int, ...]]:
     scene, dt = _read_scene(run), _read_dt(run)
     before = scene.state
     if first > int(run.first_step) + 1:
-        flight = simulate(scene, run.method, dt=dt, steps=first - int(run.first_step) - 1, record=_record_state)
+        flight = simulate(scene, _read_method(run), dt=dt, steps=first - int(run.first_step) - 1, record=_record_state)
         before = Particles(*(leaf[-1] for leaf in flight.recorded))
     speed = np.abs(np.asarray(before.velocity, float)).max(axis=-1)
     return first, tuple(int(i) for i in np.unravel_index(np.argmax(speed), speed.shape))
@@ -252,9 +259,11 @@ def _fails_in_contact(run: Trajectory, first: int) -> bool:
         return False
     before = first - int(run.first_step) - 1
     if before:
-        flight = simulate(scene, run.method, dt=dt, steps=before, save_every=before, first_step=int(run.first_step))
+        flight = simulate(
+            scene, _read_method(run), dt=dt, steps=before, save_every=before, first_step=int(run.first_step)
+        )
         scene = _demand(flight.final_scene)
-    after = scene.replace(contacts=()).step(run.method, (first - 1) * dt, dt)
+    after = scene.replace(contacts=()).step(_read_method(run), (first - 1) * dt, dt)
     return bool(jnp.all(scene.finite(after.state)))
 
 
