@@ -68,7 +68,7 @@ def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> 
         )
     if not isinstance(surface, Distanced):
         warn_of_recompilation("crossing", [surface])
-        surface = as_module(surface) if callable(surface) else Height(jnp.asarray(surface), run.scene.up)
+        surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
