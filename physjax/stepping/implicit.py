@@ -15,6 +15,7 @@ from jax import lax
 from jax.typing import ArrayLike
 
 from physjax.backend import any_lane
+from physjax.linear import MAX_CRAMER_UNKNOWNS, solve_columns
 from physjax.loops import Time
 from physjax.stepping.krylov import (
     SolveReport,
@@ -24,7 +25,7 @@ from physjax.stepping.krylov import (
     stabilised_biconjugate_gradients,
 )
 from physjax.stepping.registry import Promises
-from physjax.vectors import scale
+from physjax.vectors import components, scale, stack_components
 
 LARGEST_FORCING_TERM, SMALLEST_FORCING_TERM = 0.1, 1e-3
 """Relative residuals of the linear systems around Newton's method: of the first guess, and three digits an iteration."""
@@ -147,7 +148,7 @@ class ImplicitEuler(eqx.Module):
         self, step: "_Step", matvec: Callable, b: Vector, tolerance: ArrayLike, dissipative_symmetric: bool
     ) -> tuple[Vector, SolveReport]:
         """matvec(u) = b: in closed form where lanes stand alone, else iteratively."""
-        if step.is_independent and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED_FORMS:
+        if step.is_independent and len(b) == 1 and b[0].ndim and b[0].shape[-1] <= MAX_CRAMER_UNKNOWNS:
             u = _solve_per_lane(matvec, b[0])
             r, size = _subtract(b, matvec([u])), step.inner(b, b)
             products = jnp.full(size.shape, b[0].shape[-1], jnp.int32)
@@ -274,36 +275,11 @@ def _search_line(step, residual, u, change, square, going):
 
 
 def _solve_per_lane(matvec: Callable, b: jax.Array) -> jax.Array:
-    """The solution of a small system for each lane, by Cramer's rule."""
+    """The solution of a system of up to three unknowns for each lane, its columns read off by multiplying unit vectors."""
     dim = b.shape[-1]
     units = [jnp.broadcast_to(jnp.eye(dim, dtype=b.dtype)[i], b.shape) for i in range(dim)]
-    columns = [[matvec([e])[0][..., i] for i in range(dim)] for e in units]
-    return jnp.stack(_CLOSED_FORMS[dim](columns, [b[..., i] for i in range(dim)]), axis=-1)
-
-
-def _cramer_1(columns, b):
-    return [b[0] / columns[0][0]]
-
-
-def _cramer_2(columns, b):
-    p, q = columns
-    det = lambda a, b: a[0] * b[1] - a[1] * b[0]  # noqa: E731
-    whole = det(p, q)
-    return [det(b, q) / whole, det(p, b) / whole]
-
-
-def _cramer_3(columns, b):
-    p, q, r = columns
-
-    def det(a, b, c):
-        first, second, third = (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2] for i in range(3))
-        return a[0] * first + a[1] * second + a[2] * third
-
-    whole = det(p, q, r)
-    return [det(b, q, r) / whole, det(p, b, r) / whole, det(p, q, b) / whole]
-
-
-_CLOSED_FORMS = {1: _cramer_1, 2: _cramer_2, 3: _cramer_3}
+    columns = [components(matvec([e])[0]) for e in units]
+    return stack_components(solve_columns(columns, components(b)))
 
 
 @jax.jit
