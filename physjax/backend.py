@@ -117,9 +117,9 @@ def materialise_where(flag: Bool[Array, "..."], function: Callable[[], T], like:
 def materialise(t: ArrayLike, function: Callable[[], T]) -> T:
     """`function()`, computed once and stored before anything reads it, at any finite time t.
 
-    On a CPU by a branch whose predicate the compiler cannot evaluate: a barrier is removed there before code is
-    generated for the loop's fusions. On a GPU a branch would ask the host (tens of µs), and a barrier holds. An rk4 step
-    of a flag in the wind runs 3 times as fast with it on jax 0.12, 12 times on 0.10.1.
+    On a CPU by a branch whose predicate the compiler cannot evaluate: under jax 0.10 a barrier does not hold there. 200
+    steps of rk4 of a flag of 16 x 24 nodes take 10 ms with it, 49 without and 51 with a barrier; under jax 0.12 8, 39
+    and 9. On a GPU a branch would ask the host (tens of µs).
     """
     if on_cpu():
         return materialise_where(jnp.isfinite(t), function)
@@ -130,7 +130,8 @@ def block_fusion(tree: T) -> T:
     """The arrays as they are; what computes them is not fused with what reads them.
 
     For what each reader would otherwise compute again: a spring's tension for every component and both ends, the
-    padded copy of a sheet for each of its shifted slices, the path of a prescribed node for all of its neighbours.
+    padded copy of a sheet for each of its shifted slices, the path of a prescribed node for all of its neighbours. The
+    flag of `materialise` takes 1.4 times as long without.
     """
     return lax.optimization_barrier(tree)
 
