@@ -8,12 +8,10 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from physjax.backend import SOURCES_PER_TILE
 from physjax.checks import quantity
 from physjax.particles import Particles
 from physjax.parts import Field
-
-SOURCES_PER_TILE = 64
-"""Sources that act at once on all bodies: small enough for the vector registers and caches, large enough to hide the loop."""
 
 
 class Gravitation(Field):

@@ -4,10 +4,10 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from physjax.backend import block_fusion
 from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.physics.springs.topology import SpringTopology
@@ -42,7 +42,7 @@ class LinearisedSprings(Force):
             pull = h * product(parts_along, parts[0][slot])
             if damped:
                 pull = pull + gamma * product(parts_along, parts[1][slot])
-            pull = lax.optimization_barrier(pull)
+            pull = block_fusion(pull)
             pulls.append(topology.neighbours.scale_edges(g, edge) + topology.neighbours.scale_edges(pull, along))
         return self.force + topology.resultant(pulls)
 

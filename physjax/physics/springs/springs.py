@@ -4,10 +4,10 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from physjax.backend import block_fusion
 from physjax.checks import as_positive_integer, as_real_quantity, unchecked_quantity
 from physjax.particles import Particles
 from physjax.parts import Force
@@ -118,9 +118,7 @@ class Springs(Force):
                 pull = pull + self._take_slot(slot, self.c, d) * product(d, parts[1][slot])
             # kept apart, or it would be computed anew for every component and both ends; a division at the end is what
             # older compilers keep apart by themselves
-            weight = lax.optimization_barrier(
-                jnp.where(self._take_slot(slot, self._unbroken_slots, d), pull, 0.0) / apart
-            )
+            weight = block_fusion(jnp.where(self._take_slot(slot, self._unbroken_slots, d), pull, 0.0) / apart)
             pulls.append(topology.neighbours.scale_edges(weight, edge))
         return topology.resultant(pulls)
 

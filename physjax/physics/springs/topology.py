@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from physjax.backend import block_fusion
 from physjax.physics.springs.custom_transpose import apply_linear
 
 LAYOUTS = ("bands", "gather")
@@ -51,14 +52,14 @@ class Bands(NamedTuple):
 
     def transpose_parts(self, dim: int, *parts: Array) -> list[Array]:
         """The transpose of `parts`, which are kept apart: each is used at both ends."""
-        parts = lax.optimization_barrier(parts)
+        parts = block_fusion(parts)
         count, found = len(self.offsets) * dim, []
         for first in range(0, len(parts), count):
             sums = [
                 sum(s[..., : s.shape[-1] - d] - s[..., d:] for s, d in zip(parts[i::dim], self.offsets, strict=False))
                 for i in range(first, first + dim)
             ]
-            found.append(jnp.stack(lax.optimization_barrier(sums), axis=-1))
+            found.append(jnp.stack(block_fusion(sums), axis=-1))
         return found
 
     def ends(self, *slots: Array) -> list[Array]:
@@ -67,13 +68,13 @@ class Bands(NamedTuple):
         for first in range(0, len(slots), count):
             pairs = zip(slots[first : first + count], self.offsets, strict=True)
             total = sum(s[..., : s.shape[-1] - d] - s[..., d:] for s, d in pairs)
-            found.append(jnp.swapaxes(lax.optimization_barrier(total), -1, -2))
+            found.append(jnp.swapaxes(block_fusion(total), -1, -2))
         return found
 
     def _pad_columns(self, a):
         """Components first and nodes last, with room for the furthest neighbour on both sides; kept apart from what uses it."""
         far, columns = max(self.offsets), jnp.swapaxes(a, -1, -2)
-        return lax.optimization_barrier(jnp.pad(columns, [(0, 0)] * (a.ndim - 1) + [(far, far)]))
+        return block_fusion(jnp.pad(columns, [(0, 0)] * (a.ndim - 1) + [(far, far)]))
 
     def _slice_reachable(self, wide, d):
         """All nodes, and as many before and behind them as an offset reaches."""
@@ -110,8 +111,8 @@ class Table(NamedTuple):
 
     def edges(self, *arrays: Array) -> list[Array]:
         """Differences between both ends, slot by slot, for each array in turn; in an empty slot zero."""
-        rows = lax.optimization_barrier(jnp.concatenate(arrays, axis=-1))
-        difference = lax.optimization_barrier(take(rows, self.other) - rows[..., None, :, :])
+        rows = block_fusion(jnp.concatenate(arrays, axis=-1))
+        difference = block_fusion(take(rows, self.other) - rows[..., None, :, :])
         dim = arrays[0].shape[-1]
         return [
             difference[..., s, :, i : i + dim] for i in range(0, rows.shape[-1], dim) for s in range(len(self.other))
@@ -122,10 +123,10 @@ class Table(NamedTuple):
         count, dim, nodes = len(self.other), slots[0].shape[-1], slots[0].shape[-2]
         parts = [slots[i : i + count] for i in range(0, len(slots), count)]
         rows = [jnp.concatenate(row, axis=-1) for row in zip(*parts, strict=True)]
-        rows = lax.optimization_barrier(jnp.concatenate([*rows, jnp.zeros_like(rows[0][..., :1, :])], axis=-2))
+        rows = block_fusion(jnp.concatenate([*rows, jnp.zeros_like(rows[0][..., :1, :])], axis=-2))
         total = sum(take(rows, places) for places in self.arrivals)
         total = total - sum(rows[..., s * nodes : (s + 1) * nodes, :] for s in range(count))
-        total = lax.optimization_barrier(total)
+        total = block_fusion(total)
         return [total[..., i : i + dim] for i in range(0, total.shape[-1], dim)]
 
     def at(self, number: Any, slot: int) -> Any:
