@@ -112,6 +112,19 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
     return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
 
 
+def add_trailing_axes(number: Array, ndim: int) -> Array:
+    """A number per scene with axes of length 1 behind its own, `ndim` in all, so that it meets numbers per lane.
+
+    A scalar stays one: it meets everything as it is, and the compiled program has one operation fewer.
+    """
+    return number.reshape(number.shape + (1,) * (ndim - number.ndim)) if number.ndim else number
+
+
+def add_leading_axes(number: Array, ndim: int) -> Array:
+    """A number per spring or per node with axes of length 1 before its own, `ndim` in all; a scalar stays one."""
+    return number.reshape((1,) * (ndim - number.ndim) + number.shape) if number.ndim else number
+
+
 def broadcast_vector(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """One vector `(dim,)` for all lanes, or one per lane, broadcast to the shape of `like`.
 
