@@ -6,11 +6,15 @@ times slower on CPU). Derivatives are safe where the formulas are not: the norm 
 any order and in any nesting of forward and reverse mode.
 """
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 
 def dot(a: Float[Array, "*lanes dim"], b: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
@@ -112,7 +116,7 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
     return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
 
 
-def add_trailing_axes(number: Array, ndim: int) -> Array:
+def add_trailing_axes(number: AnyArray, ndim: int) -> AnyArray:
     """A number per scene with axes of length 1 behind its own, `ndim` in all, so that it meets numbers per lane.
 
     A scalar stays one: it meets everything as it is, and the compiled program has one operation fewer.
@@ -120,7 +124,7 @@ def add_trailing_axes(number: Array, ndim: int) -> Array:
     return number.reshape(number.shape + (1,) * (ndim - number.ndim)) if number.ndim else number
 
 
-def add_leading_axes(number: Array, ndim: int) -> Array:
+def add_leading_axes(number: AnyArray, ndim: int) -> AnyArray:
     """A number per spring or per node with axes of length 1 before its own, `ndim` in all; a scalar stays one."""
     return number.reshape((1,) * (ndim - number.ndim) + number.shape) if number.ndim else number
 
