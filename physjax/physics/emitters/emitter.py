@@ -109,7 +109,7 @@ class Emitter(eqx.Module):
         self.slot = jnp.arange(self.pool, dtype=jnp.int32)
         self.start_rest = float32_remainder(self.start, self.start_rest)
         if self.generation is None:  # given where `dataclasses.replace` changes a number during a run
-            memory = _begin_memory(self.pool, self.start.dtype)
+            memory = _begin_memory(self.slot.size, jnp.result_type(float))
             self.generation, self.born, self.born_rest, self.dies, self.dies_rest = memory
 
     def __check_init__(self):
