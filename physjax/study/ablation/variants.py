@@ -44,21 +44,22 @@ class Variant(NamedTuple):
 
 
 class _Slot(NamedTuple):
-    """Where a part stands in a scene: its name, whether it is a contact, and its index among those."""
+    """Where a part stands in a scene: its name, whether it is a contact, and its place among those."""
 
     name: str
     is_contact: bool
-    index: int
+    place: int
 
 
 def list_variants(scene: Scene, run: Trajectory, lanes: Mapping[str, int]) -> tuple[list[Variant], list[str]]:
     """Every force, option, simpler law, contact, lane named, and dimension in turn; and why what cannot go must stay."""
     found = []
     for slot in _list_slots(scene):
-        part = (scene.contacts if slot.is_contact else scene.forces)[slot.index]
+        part = (scene.contacts if slot.is_contact else scene.forces)[slot.place]
         found.append(Variant(slot.name, _replace_part(scene, slot)))
         found += [
-            Variant(label, _replace_part(scene, slot, other)) for label, other in _list_simpler_parts(slot, part, run)
+            Variant(label, _replace_part(scene, slot, other))
+            for label, other in _list_simpler_parts(slot, part, scene, run)
         ]
     found += [remove_lane(scene, name, lane) for name, lane in lanes.items()]
     notes = []
@@ -89,28 +90,30 @@ def _list_slots(scene: Scene) -> list[_Slot]:
 def _replace_part(scene: Scene, slot: _Slot, *instead: Part) -> Scene:
     """The scene with something instead of one of its forces or contacts, or nothing."""
     acting, touching = list(scene.forces), list(scene.contacts)
-    (touching if slot.is_contact else acting)[slot.index : slot.index + 1] = instead
+    (touching if slot.is_contact else acting)[slot.place : slot.place + 1] = instead
     return Scene(scene.state, scene.mass, acting, touching, scene.pinned, scene.emitter)
 
 
-def _list_simpler_parts(slot: _Slot, part: Part, run: Trajectory) -> list[tuple[str, Part]]:
+def _list_simpler_parts(slot: _Slot, part: Part, scene: Scene, run: Trajectory) -> list[tuple[str, Part]]:
     """A force or contact by a simpler law, without one of its options, or with impacts that are not timed."""
     simpler: list[tuple[str, Part]] = []
     if isinstance(part, forces.QuadraticDrag):
         stokes = forces.StokesDrag.of_sphere(jnp.sqrt(part.area / math.pi), wind=part.wind)
         simpler.append(("Stokes' law instead", stokes))
     if isinstance(part, forces.SphereDrag):
-        quadratic = forces.QuadraticDrag(math.pi * part.radius**2, NEWTON_DRAG_COEFFICIENT, part.density, part.wind)
+        quadratic = forces.QuadraticDrag(
+            math.pi * part.radius**2, jnp.asarray(NEWTON_DRAG_COEFFICIENT), part.density, part.wind
+        )
         simpler.append(("quadratic law instead", quadratic))
         stokes = forces.StokesDrag.of_sphere(part.radius, part.viscosity, part.wind)
         simpler.append(("Stokes' law instead", stokes))
-    simpler += _list_simpler_springs(part) if isinstance(part, Springs) else _list_options(part, run)
+    simpler += _list_simpler_springs(part) if isinstance(part, Springs) else _list_options(part, scene, run)
     if isinstance(part, Contact) and part.response is contacts.impact:
         simpler.append(("timing of impacts", replace(forget_contacts(part), response=contacts.project)))
     return [(f"{slot.name}: {label}", other) for label, other in simpler]
 
 
-def _list_options(part: Part, run: Trajectory) -> list[tuple[str, Part]]:
+def _list_options(part: Part, scene: Scene, run: Trajectory) -> list[tuple[str, Part]]:
     """The options that a part has, by name, with the part without each.
 
     An option is a declared number, or a record of such, that may be left at None and is then as if it were zero: wind,
@@ -131,16 +134,16 @@ def _list_options(part: Part, run: Trajectory) -> list[tuple[str, Part]]:
             zero = replace(fresh, **{field.name: jax.tree.map(jnp.zeros_like, value)})
         except (TypeError, ValueError):  # a part that cannot do without it
             continue
-        if _act_alike(without, zero, run):
+        if _act_alike(without, zero, scene, run):
             found.append((field.name, without))
     return found
 
 
-def _act_alike(part: Part, other: Part, run: Trajectory) -> bool:
+def _act_alike(part: Part, other: Part, scene: Scene, run: Trajectory) -> bool:
     """Whether two parts do the same, but for rounding, at the start and at the end of a run."""
     for i in (0, -1):
         t, state = run.time[i], jax.tree.map(lambda leaf, i=i: leaf[i], run.state)
-        both = [jax.tree.leaves(measure_part(each, t, state, run.scene)) for each in (part, other)]
+        both = [jax.tree.leaves(measure_part(each, t, state, scene)) for each in (part, other)]
         for one, two in zip(*both, strict=True):
             largest = np.nanmax(np.maximum(np.abs(one), np.abs(two)), initial=0.0)
             if np.any(np.abs(one - two) > AGREEMENT_SHARE * largest):
@@ -156,6 +159,7 @@ def _list_simpler_springs(springs: Springs) -> list[tuple[str, Part]]:
         return []  # swept over scenes
     spread = [None if number is None else np.broadcast_to(np.asarray(number), (count,)) for number in numbers]
     stiffness, rest_length, damping, breaks_at = spread
+    assert stiffness is not None
 
     def select_springs(kept, damping=damping):
         numbers = [None if a is None else a[kept] for a in (stiffness, rest_length, damping, breaks_at)]
