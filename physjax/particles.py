@@ -1,12 +1,6 @@
-"""Point masses, the state of most scenes; and so what a scene asks of any record of moving things.
+"""Point masses, the state of most scenes, and what a scene asks of any record of moving things."""
 
-A record has `lanes` and `dtype`; is `validate` with its mass when a scene is built; tells what a `evaluate_load` does to it and
-their `total`, how it is `generalised_force` and its `rate` for that; kicks, drifts, and is `held`. A record whose arrays must
-agree with each other (a quaternion is of length 1) is also `settled` after every step. A scene calls these and knows
-nothing else of what moves in it.
-"""
-
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +8,77 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import as_real_array, as_real_quantity
-from physjax.loops import Time, time_for_part
+from physjax.loops import Time, time_for_part, to_float_time
 from physjax.vectors import dot, scale
+
+
+class StateRecord(Protocol):
+    """What a scene asks of a record of moving things; it knows nothing else of what moves in it.
+
+    `validate` checks it against its mass when a scene is built. `view_for_force` is what a force sees of it,
+    `evaluate_load` what a force does to it, `generalised_force` the sum of that, `rate` its time derivative; `kick` and
+    `drift` are the two halves of a step. `normalised` restores what a step does not keep, such as quaternions of length 1.
+    """
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Shape of the lanes."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Floating-point type, which every number of the scene follows."""
+        ...
+
+    @property
+    def place(self) -> Any:
+        """What the errors of a path are measured by."""
+        ...
+
+    @property
+    def rotates(self) -> bool:
+        """Whether it has an orientation."""
+        ...
+
+    def validate(self, mass: Any) -> tuple[Any, Any]:
+        """State and mass as arrays that fit; ValueError or TypeError otherwise."""
+        ...
+
+    def view_for_force(self, force: Any, mass: Any) -> tuple[Any, Any]:
+        """The state and the mass that a force sees."""
+        ...
+
+    def evaluate_load(self, force: Any, t: Time, mass: Any) -> Any:
+        """What a force does to each lane."""
+        ...
+
+    def sum_loads(self, terms: Any) -> Any:
+        """The sum of loads."""
+        ...
+
+    def generalised_force(self, scene: Any, t: Time) -> Any:
+        """All that changes the velocities in a scene at the time t [s]."""
+        ...
+
+    def rate(self, loads: Any, mass: Any) -> Any:
+        """Time derivative under these loads."""
+        ...
+
+    def kick(self, rate: Any, dt: ArrayLike) -> Any:
+        """Velocities changed by `rate` for a time dt [s]."""
+        ...
+
+    def drift(self, dt: ArrayLike, mass: Any) -> Any:
+        """Places moved by the velocities for a time dt [s]."""
+        ...
+
+    def normalised(self, mass: Any) -> Any:
+        """The state as it must be after a step."""
+        ...
+
+    def hold_lanes(self, free: Array) -> Any:
+        """The state with held lanes (free = 0) at rest."""
+        ...
 
 
 class Particles(NamedTuple):
@@ -56,13 +119,34 @@ class Particles(NamedTuple):
         """What a force does to each lane [N], shaped like the velocity; seen once, while tracing."""
         return check_load_shape(force, force(time_for_part(force, t), self, mass), self.velocity)
 
+    def evaluate_field(self, field: Any, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """The acceleration that a field gives to each lane [m/s²]."""
+        return check_load_shape(field, field.acceleration(time_for_part(field, t), self, mass), self.velocity)
+
     def sum_loads(self, terms: Any) -> Float[Array, "*lanes dim"]:
         """The sum of loads [N]."""
         return sum_terms(terms) if terms else jnp.zeros_like(self.velocity)
 
     def generalised_force(self, scene: Any, t: Time) -> Float[Array, "*lanes dim"]:
-        """Acceleration [m/s²]."""
-        return scene.acceleration(t, self)
+        """Newton's second law, a = ΣF/m [m/s²]: fields first, so that a falling body never looks its mass up.
+
+        Held lanes do not accelerate, kinematic ones as their path does; what rests on a surface is held by its reaction.
+        """
+        motion, state = scene.prescribed_motion, self
+        if motion is not None:
+            state = motion.prescribe(to_float_time(t), state)
+        free = None if scene.held is None else 1 - scene.held.astype(state.dtype)
+        fields = [state.evaluate_field(f, t, scene.mass) for f in scene.forces if f.is_field]
+        newtons = [state.evaluate_load(f, t, scene.mass) for f in scene.forces if not f.is_field]
+        total = []
+        if fields:
+            total.append(sum_terms(fields) if free is None else scale(free, sum_terms(fields)))
+        if newtons:
+            total.append(scale((1.0 if free is None else free) / scene.mass, sum_terms(newtons)))
+        acceleration = sum_terms(total) if total else jnp.zeros_like(state.velocity)
+        if motion is not None:
+            acceleration = motion.prescribe_acceleration(to_float_time(t), state, acceleration)
+        return acceleration if scene.reaction is None else scene.reaction(to_float_time(t), state, acceleration)
 
     def rate(self, acceleration: Float[Array, "*lanes dim"], mass: Any = None) -> "Particles":
         """Time derivative: position changes with the velocity, velocity with the acceleration."""
@@ -75,6 +159,15 @@ class Particles(NamedTuple):
     def drift(self, dt: ArrayLike, mass: Any = None) -> "Particles":
         """x += v dt, the velocity untouched."""
         return Particles(self.position + scale(dt, self.velocity), self.velocity)
+
+    @property
+    def rotates(self) -> bool:
+        """Points do not rotate."""
+        return False
+
+    def normalised(self, mass: Any = None) -> "Particles":
+        """The state itself: its arrays need not agree with each other."""
+        return self
 
     def hold_lanes(self, free: Float[Array, "*lanes"]) -> "Particles":
         """The state with the velocity of held lanes (free = 0) set to zero."""
@@ -115,6 +208,15 @@ class Particles(NamedTuple):
         if mass.shape not in ((), state.lanes):
             raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {state.lanes}.")
         return state, mass
+
+
+def demand_state_record(state: Any) -> None:
+    """Raise a TypeError for a state that is no record of moving things."""
+    if not hasattr(type(state), "validate"):
+        raise TypeError(
+            f"Scene: got a state of type {type(state).__name__}, expected Particles(position, velocity), "
+            "or RigidBodies(position, orientation, momentum, angular_momentum)."
+        )
 
 
 def demand_particles(what: str, state: Any, why: str) -> None:

@@ -59,6 +59,9 @@ class Pins(eqx.Module):
         # kept apart: XLA on CPU would follow the path again for every neighbour that looks at a lane
         return state._replace(**lax.optimization_barrier({"position": position, "velocity": velocity}))
 
+    lead = prescribe
+    """The name of the first edition."""
+
     def prescribe_acceleration(
         self, t: ArrayLike, state: Particles, acceleration: Float[Array, "*lanes dim"]
     ) -> Float[Array, "*lanes dim"]:

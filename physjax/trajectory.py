@@ -16,7 +16,7 @@ from physjax.crossing import Crossing, find_first_crossing
 from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
 from physjax.loops import moment_at
 from physjax.particles import Particles
-from physjax.parts import Contact, Function, as_module, build_memory_mask
+from physjax.parts import Contact, Function, as_module, build_memory_mask, callable_name, has_memory
 from physjax.scene import Scene
 
 
@@ -65,9 +65,9 @@ class Trajectory(eqx.Module):
             [ 3.  -5.8]
         """
         states = self._demand_states()
-        return (
-            states.velocity if hasattr(states, "velocity") else states.view_for_force(None, self.scene.mass)[0].velocity
-        )
+        if isinstance(states, Particles):
+            return states.velocity
+        return states.view_for_force(None, self._demand_scene("velocity").mass)[0].velocity
 
     @property
     def method(self) -> Any:
@@ -125,7 +125,7 @@ class Trajectory(eqx.Module):
     def __repr__(self) -> str:
         """One line: what was run, for how long, and whether it held."""
         method = self.method
-        how = "" if method is None else f"{getattr(method, '__name__', type(method).__name__)}, "
+        how = "" if method is None else f"{callable_name(method)}, "
         if concrete_or_none(self.time) is None or np.ndim(self.first_step):
             return f"<Trajectory: {how}{self.steps} steps, traced or out of vmap>"
         time, ok = np.asarray(self.time), np.asarray(self.ok)
@@ -167,7 +167,7 @@ class Trajectory(eqx.Module):
             (21,)
         """
         arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
-        arrays |= {"method": _get_method_name(self.method), "format": RUN_FORMAT}
+        arrays |= {"method": callable_name(self.method), "format": RUN_FORMAT}
         if self.dt is not None:
             arrays["dt"] = self.dt
         if self.scene is not None and self.stepper is not None:
@@ -239,32 +239,24 @@ def _find_first_bad_step(scene, method, dt, first_step, steps):
 
 
 def select_stateful_parts(scene: Scene) -> tuple:
-    """Those of the scene's parts that remember: forces that advance, contacts that know who touches them, an emitter."""
-    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if _has_memory(part))
+    """The parts of the scene with memory: forces that advance, contacts that know who touches them, an emitter."""
+    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if has_memory(part))
 
 
 def _replace_memories(scene: Scene, state: Any, parts: tuple) -> Scene:
     """The scene with another state, and with other memories in those of its parts that have some."""
     parts = iter(parts)
-    renewed = lambda old: tuple(next(parts) if _has_memory(part) else part for part in old)  # noqa: E731
+    renewed = lambda old: tuple(next(parts) if has_memory(part) else part for part in old)  # noqa: E731
     forces, contacts, (emitter,) = renewed(scene.forces), renewed(scene.contacts), renewed((scene.emitter,))
     return scene.replace(state=state, forces=forces, contacts=contacts, emitter=emitter)
-
-
-def _has_memory(part: Any) -> bool:
-    return hasattr(part, "advance") or bool(getattr(part, "memory", ()))
-
-
-def _get_method_name(method: Any) -> str:
-    return getattr(method, "__name__", type(method).__name__)
 
 
 def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
     """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
     ours, made_by = "dt" in arrays, str(arrays.pop("method"))
-    if ours and method is not None and made_by not in (_get_method_name(method), "NoneType"):
+    if ours and method is not None and made_by not in (callable_name(method), "NoneType"):
         raise ValueError(
-            f"load: the run was made with the method {made_by}, got {_get_method_name(method)}. Give the method it was made "
+            f"load: the run was made with the method {made_by}, got {callable_name(method)}. Give the method it was made "
             "with; to go on with another one, simulate(run.final_scene, ...)."
         )
     if scene is not None and ours:

@@ -23,9 +23,9 @@ def _run_stability(name: str, out: str, steps: int) -> None:
 
     from physjax.checks import as_positive_integer, demand_known
     from physjax.files import ensure_writable_folder, write_atomically
+    from physjax.parts import callable_name
     from physjax.scenes import FAILURES, SCENES
     from physjax.stepping.methods import METHODS
-    from physjax.stepping.registry import method_name
     from physjax.study import stability
     from physjax.study.stability.survey import find_fastest_moment, map_around_limits
     from physjax.text import describe_machine, format_seconds, format_table
@@ -66,7 +66,7 @@ def _run_stability(name: str, out: str, steps: int) -> None:
         print("No method has a limit here, so there is no map to draw.")
     if name in FAILURES:
         reported = stability.explain(scene, problem.method, problem.dt, steps=problem.steps)
-        print(f"{method_name(problem.method)} with dt = {format_seconds(problem.dt)}: {reported}")
+        print(f"{callable_name(problem.method)} with dt = {format_seconds(problem.dt)}: {reported}")
     print(f"Measured on {describe_machine()}.")
 
 

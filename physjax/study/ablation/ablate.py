@@ -14,8 +14,8 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.checks import as_real_quantity
+from physjax.parts import callable_name
 from physjax.scene import Scene
-from physjax.stepping.registry import method_name
 from physjax.stepping.simulate import simulate
 from physjax.study.ablation.variants import Variant, list_pair_variants, list_variants
 from physjax.study.stability.limits import check_method
@@ -189,7 +189,7 @@ def ablate(
     compare = partial(_compare_with_whole, whole=measured[0], clock=times[0], threshold=threshold)
     names = [one.name for one in everything]
     effects = list(map(compare, names, measured, times, costs))
-    return Ablation(effects[0], tuple(effects[1:]), threshold, method_name(method), float(dt), tuple(notes))
+    return Ablation(effects[0], tuple(effects[1:]), threshold, callable_name(method), float(dt), tuple(notes))
 
 
 def _check_outcome(outcome: Outcome) -> None:

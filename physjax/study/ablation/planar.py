@@ -9,14 +9,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from physjax.particles import Particles
-from physjax.parts import Contact, find_plain_functions, force_name
+from physjax.parts import Contact, Force, callable_name, find_plain_functions
 from physjax.quantities import Number, collect_numbers
 from physjax.scene import Scene
 from physjax.trajectory import Trajectory
@@ -92,15 +91,15 @@ def _find_still_axis(run: Trajectory) -> int | None:
     return int(np.flatnonzero(still)[-1]) if still.any() else None
 
 
-def _reduce_part(part: eqx.Module, plane: _Plane) -> eqx.Module:
+def _reduce_part(part: Force | Contact, plane: _Plane) -> Force | Contact:
     """A force or contact in the plane; `_Reason` if it has no counterpart there."""
     numbers, structure = collect_numbers(part)
-    name = force_name(part)
+    name = callable_name(part)
     if find_plain_functions(part):
         raise _Reason(f"{name} is, or holds, a plain function, whose numbers are not declared; write it as a Force")
     reduced = [_reduce_number(i, numbers, structure, part, plane) for i in range(len(numbers))]
     flat = forget_contacts(structure.unflatten(reduced))
-    up = vars(part).get("up")
+    up = part.up_axis if isinstance(part, Force) else None
     if up is not None:
         if up == plane.axis:
             raise _Reason(f"{name} points across the plane")
@@ -109,16 +108,16 @@ def _reduce_part(part: eqx.Module, plane: _Plane) -> eqx.Module:
     return flat
 
 
-def forget_contacts(part: eqx.Module) -> eqx.Module:
+def forget_contacts(part: Force | Contact) -> Force | Contact:
     """A contact without its memory, which belongs to the lanes of a scene; a force as it is."""
     return replace(part, **dict.fromkeys(part.memory)) if isinstance(part, Contact) and part.memory else part
 
 
 def _reduce_number(
-    i: int, numbers: list[Number], structure: jax.tree_util.PyTreeDef, part: eqx.Module, plane: _Plane
+    i: int, numbers: list[Number], structure: jax.tree_util.PyTreeDef, part: Force | Contact, plane: _Plane
 ) -> Array:
     """A number of a part in the plane, by its declared kind."""
-    number, axis, owner = numbers[i], plane.axis, force_name(part)
+    number, axis, owner = numbers[i], plane.axis, callable_name(part)
     if number.quantity is None:
         raise _Reason(f"{number.field} of {owner} is not declared: quantity(..., kind=) says what it is in a plane")
     kind, value, what = number.quantity.kind, jnp.asarray(number.value), f"{number.field} of {owner}"
@@ -159,14 +158,14 @@ def _depends_across(i: int, numbers: list[Number], structure: jax.tree_util.PyTr
     return any(map(np.any, slopes))
 
 
-def measure_part(part: eqx.Module, t: Array, state: PyTree, scene: Scene) -> PyTree:
+def measure_part(part: Force | Contact, t: Array, state: PyTree, scene: Scene) -> PyTree:
     """What a part is known by: the load on each lane [N], or the distance of each from a surface [m]."""
     if isinstance(part, Contact):
         return part.signed_distance(t, state.position)
     return state.evaluate_load(part, t, scene.mass)
 
 
-def _demand_agreement(part: eqx.Module, flat: eqx.Module, name: str, plane: _Plane) -> None:
+def _demand_agreement(part: Force | Contact, flat: Force | Contact, name: str, plane: _Plane) -> None:
     """Raise a `_Reason` unless the reduced part does along the run what the whole one does."""
     for t, state in plane.iterate_moments():
         whole = measure_part(part, t, state, plane.scene)

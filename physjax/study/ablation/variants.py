@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from physjax.checks import as_positive_integer
 from physjax.particles import Particles
-from physjax.parts import Contact, find_plain_functions, force_name
+from physjax.parts import Contact, Force, callable_name, find_plain_functions
 from physjax.physics import contacts, forces
 from physjax.physics.springs.springs import Springs
 from physjax.quantities import collect_numbers
@@ -31,8 +31,7 @@ MAX_SPRING_KINDS = 6
 PER_ENTRY = ("spring", "joint", "point")
 """Numbers of which there is one for something that refers to lanes by their index."""
 
-Part = eqx.Module
-"""A force or a contact."""
+Part = Force | Contact
 
 
 class Variant(NamedTuple):
@@ -182,7 +181,7 @@ def remove_lane(scene: Scene, name: str, lane: int) -> Variant:
         raise ValueError(
             f"lanes: got {name!r} = {lane}, but the scene's lanes are {lanes}. Give an index into the last axis."
         )
-    fixed = [force_name(part) for part in (*scene.forces, *scene.contacts) if _refers_to_lanes(part)]
+    fixed = [callable_name(part) for part in (*scene.forces, *scene.contacts) if _refers_to_lanes(part)]
     if not isinstance(scene.state, Particles) or scene.prescribed_motion is not None or fixed:
         raise ValueError(
             f"lanes: {name!r} cannot be left out of bodies, of prescribed motion, or where {', '.join(fixed) or 'something'} "
@@ -195,7 +194,7 @@ def remove_lane(scene: Scene, name: str, lane: int) -> Variant:
 
 def _refers_to_lanes(part: Part) -> bool:
     """Whether a part that couples lanes refers to them by index, or may do so where no declaration shows it."""
-    if not getattr(part, "couples", True):  # a module of the user's that is no Force counts as coupling
+    if not part.couples:
         return False
     static = [field for field in fields(part) if field.metadata.get("static", False) and field.name != "couples"]
     quantities = [number.quantity for number in collect_numbers(part)[0]]

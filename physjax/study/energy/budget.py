@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from physjax.parts import callable_name
 from physjax.scene import Scene, project
-from physjax.stepping.registry import method_name
 from physjax.study.energy.audit import NUMERICAL, RESPONSE_OBSERVERS, EnergyBudget, audit_run, list_causes
 from physjax.text import format_table
 from physjax.trajectory import Trajectory
@@ -201,7 +201,7 @@ def _build_accounts(
         accounts[name] = Account(UNITS[name], received, stock["sizes"][name])
     return Ledger(
         np.asarray(frames_first(np.asarray(run.time, float))),
-        method_name(run.method),
+        callable_name(run.method),
         accounts["energy"],
         accounts["momentum"],
         accounts.get("angular momentum"),
