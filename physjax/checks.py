@@ -93,7 +93,7 @@ def demand_direction(name: str, vector: Array) -> None:
         demand_all(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
 
 
-VECTOR_KINDS = ("vector", "place")
+VECTOR_KINDS = ("vector", "place", "corner")
 """Kinds with one component for each dimension of space."""
 KINDS = ("number", *VECTOR_KINDS, "axial", "rotation", "tensor")
 ENTRY_AXIS_COUNT = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, "memory": 0, None: 0}
@@ -103,8 +103,8 @@ ENTRY_AXIS_COUNT = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, 
 class Quantity(NamedTuple):
     """What a field of a part of a scene is: its name and unit, what kind of number, what there is one of it for, its bounds.
 
-    `kind`: a "number", a "vector", a "place", an "axial" vector (a number in the plane), a "rotation"
-    (a quaternion) or a "tensor" `(dim, dim)`.
+    `kind`: a "number", a "vector", a "place", a "corner" (a place of which each component bounds its own axis alone), an
+    "axial" vector (a number in the plane), a "rotation" (a quaternion) or a "tensor" `(dim, dim)`.
     `per`: one for all lanes or one per "lane"; a "table" of any length, one for all lanes or one per lane; one per
     "point", "joint" or "spring"; "memory" of what each lane did in a run; None is shared by all lanes, whatever its shape.
     """

@@ -179,8 +179,8 @@ class Room(Surface):
     """
 
     curved: ClassVar[bool] = False
-    lower: Float[Array, "..."] = quantity("lower corner", "m", kind="place")
-    upper: Float[Array, "..."] = quantity("upper corner", "m", kind="place")
+    lower: Float[Array, "..."] = quantity("lower corner", "m", kind="corner")
+    upper: Float[Array, "..."] = quantity("upper corner", "m", kind="corner")
 
     def __check_init__(self):
         lower, upper = concrete_or_none(self.lower), concrete_or_none(self.upper)

@@ -61,8 +61,8 @@ class Turbulence(Flow):
     coefficient: Numbers = quantity("drag coefficient b", "kg/s", at_least=0)
     speed: Numbers = quantity("speed of the eddies", "m/s", per=None, at_least=0)
     size: Numbers = quantity("size of the eddies", "m", per=None, above=0)
-    waves: Float[Array, "modes dim"] = unchecked_quantity("wave vectors", "1/m", per=None)
-    amplitudes: Float[Array, "modes dim"] = unchecked_quantity("amplitudes", per=None)
+    waves: Float[Array, "modes dim"] = unchecked_quantity("wave vectors", "1/m", kind="vector", per=None)
+    amplitudes: Float[Array, "modes dim"] = unchecked_quantity("amplitudes", kind="vector", per=None)
     phases: Float[Array, "modes"] = unchecked_quantity("phases", "rad", per=None)
 
     def __init__(
