@@ -1,7 +1,7 @@
 """The parts of a scene: what a force and a contact are, and what becomes of them when a scene is built."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -114,6 +114,10 @@ class Contact(eqx.Module):
     @abstractmethod
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after a touch; lanes that touch nothing stay as they are."""
+
+    def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray] | None:
+        """Polygons `(corners, 3)` [m] that show the surface in a box in space; None: they follow from the signed distance."""
+        return None
 
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
         """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
