@@ -6,15 +6,15 @@ surface nets (Gibson, "Constrained elastic surface nets", 1998): one vertex in e
 quadrilateral around each edge of the grid that it cuts. Details smaller than a cell are lost.
 """
 
-from itertools import product
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from physjax.checks import ENTRY_AXIS_COUNT
 from physjax.parts import Contact
+from physjax.quantities import collect_numbers
 from physjax.show.stage import NEAR_FLOOR_SHARE, REACH_SHARE, Stage
 
 SURVEY_CELLS = {2: 64, 3: 24}
@@ -36,7 +36,11 @@ def evaluate_distance(contact: Contact, t: float, points: np.ndarray) -> np.ndar
 
 def project_onto_surface(contact: Contact, t: float, points: np.ndarray, longest_step: float) -> np.ndarray:
     """Points `(n, dim)` moved onto the surface along the gradient, by at most `longest_step` [m] at a time."""
-    contact = _as_float64(contact)
+    contact, number = _as_float64(contact), len(points)
+    if not number:
+        return points
+    # a moving surface has another number of vertices in every frame: in sizes of powers of two few programs are compiled
+    points = np.concatenate([points, np.repeat(points[:1], (1 << (number - 1).bit_length()) - number, axis=0)])
     for _ in range(PROJECTION_STEPS):
         with jax.enable_x64(True):
             distance, slope = (np.asarray(x) for x in _distance_and_gradient(contact, np.asarray(t, float), points))
@@ -46,20 +50,28 @@ def project_onto_surface(contact: Contact, t: float, points: np.ndarray, longest
         length = np.where(usable, distance, 0.0) / np.sqrt(np.where(usable, steepness, 1.0))
         along = np.where(usable[:, None], slope, 0.0) / np.sqrt(np.where(usable, steepness, 1.0))[:, None]
         points = points - np.clip(length, -longest_step, longest_step)[:, None] * along
-    return points
+    return points[:number]
 
 
 def is_shared(contact: Contact, dim: int) -> bool:
     """Whether a surface is the same for all lanes: a single point then has a single distance."""
     if contact.couples:
         return False  # how far a lane is from the others is no surface
+    point = jax.ShapeDtypeStruct((1, dim), np.float64)
     with jax.enable_x64(True):
-        point = jax.ShapeDtypeStruct((1, dim), np.float64)
         try:
-            distance = jax.eval_shape(_as_float64(contact).signed_distance, np.zeros(()), point)
-        except (TypeError, ValueError):  # numbers for each lane do not fit a single point
-            return False
+            distance = eqx.filter_eval_shape(_distance, _as_float64(contact), np.zeros(()), point)
+        except (TypeError, ValueError):
+            if _has_number_per_lane(contact, dim):
+                return False  # which does not fit a single point
+            raise
     return distance.shape == (1,)
+
+
+def _has_number_per_lane(contact: Contact, dim: int) -> bool:
+    numbers = collect_numbers(contact)[0]
+    declared = [(np.ndim(number.value), number.quantity) for number in numbers if number.quantity is not None]
+    return any(axes > len(quantity.axes(dim)) + ENTRY_AXIS_COUNT[quantity.per] for axes, quantity in declared)
 
 
 def moves(contact: Contact, stage: Stage, times: np.ndarray) -> bool:
@@ -99,55 +111,42 @@ def find_corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
 def extract_level_set(contact: Contact, stage: Stage, t: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices `(vertices, 3)` [m] and quadrilaterals `(faces, 4)` of a surface in a box, `cells` along its longest side.
 
-    The corners of a face go round counter-clockwise as seen from the legal side.
+    The corners of a face go round counter-clockwise as seen from the legal side. Some faces reach out of the box.
     """
     width = stage.size / cells
-    count = np.maximum(np.ceil((stage.high - stage.low) / width).astype(int), 2)
+    count = np.maximum(np.ceil((stage.high - stage.low) / width).astype(int), 2) + 2
     # a cell more on each side: a face needs all four cells around its edge, and would end before the box does
-    low, high = stage.low - width, stage.low + (count + 1) * width
-    grid = _build_grid(low, high, count + 2)
-    distance = evaluate_distance(contact, t, grid)
-    distance = np.minimum(distance, 10 * stage.size)  # shares of an infinite difference are no numbers
-    crossed, middle = _average_crossings(grid, distance)
-    numbers = np.full(crossed.shape, -1)
-    numbers[crossed] = np.arange(crossed.sum())
-    return project_onto_surface(contact, t, middle[crossed], width), _join_cells(numbers, distance)
+    grid = _build_grid(stage.low - width, stage.low + (count - 1) * width, count)
+    distance = np.minimum(evaluate_distance(contact, t, grid), stage.size * cells)  # infinite numbers have no shares
+    points, around = _find_cut_edges(grid, distance)
+    inside = ((around >= 0) & (around < count)).all(axis=-1)
+    number = np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(count), mode="clip")
+    used, index = np.unique(number[inside], return_inverse=True)
+    total = np.zeros((len(used), 3))
+    np.add.at(total, index, np.repeat(points, inside.sum(axis=1), axis=0))
+    vertices = total / np.bincount(index, minlength=len(used))[:, None]
+    return project_onto_surface(contact, t, vertices, width), np.searchsorted(used, number[inside.all(axis=1)])
 
 
-def _average_crossings(grid: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which cells the surface passes, and the mean of the points in which it cuts the edges of each."""
-    cells = tuple(n - 1 for n in distance.shape)
-    total, count = np.zeros((*cells, 3)), np.zeros(cells, int)
+def _find_cut_edges(grid: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the surface cuts edges of the grid `(edges, 3)` [m], and the cells around each `(edges, 4, 3)`.
+
+    The cells go round counter-clockwise as seen from the legal side; at the border some are none of the grid's.
+    """
+    points, cells = [], []
     for axis in range(3):
-        start, end = (_slice(distance, axis, part) for part in (slice(None, -1), slice(1, None)))
-        crosses = (start < 0) != (end < 0)
-        share = np.where(crosses, start / np.where(crosses, start - end, 1.0), 0.0)
-        first, last = (_slice(grid, axis, part) for part in (slice(None, -1), slice(1, None)))
-        point = np.where(crosses[..., None], first + share[..., None] * (last - first), 0.0)
-        # each edge belongs to the four cells around it
-        for near in product((0, 1), repeat=2):
-            part = _around(axis, [slice(side, side + cells[i]) for side, i in zip(near, _others(axis), strict=True)])
-            total += point[part]
-            count += crosses[part]
-    return count > 0, total / np.maximum(count, 1)[..., None]
-
-
-def _join_cells(numbers: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """The faces: for each edge that is cut, the vertices of the four cells around it."""
-    faces = []
-    for axis in range(3):
-        inner = [slice(1, -1)] * 2
-        start, end = (_slice(distance, axis, part)[_around(axis, inner)] for part in (slice(None, -1), slice(1, None)))
-        crosses = (start < 0) != (end < 0)
-        around = [
-            numbers[_around(axis, [slice(None, -1) if side else slice(1, None) for side in near])][crosses]
-            for near in ((1, 1), (0, 1), (0, 0), (1, 0))
-        ]
-        face = np.stack(around, axis=-1)
-        turned = start[crosses] >= 0  # the legal side is at the start of the edge
-        face[turned] = face[turned][:, ::-1]
-        faces.append(face)
-    return np.concatenate(faces)
+        along, first, second = np.roll(np.eye(3, dtype=int), -axis, axis=0)  # right-handed: along = first x second
+        before = distance[: -1 if axis == 0 else None, : -1 if axis == 1 else None, : -1 if axis == 2 else None]
+        after = distance[along[0] :, along[1] :, along[2] :]
+        at = np.argwhere((before < 0) != (after < 0))
+        start, end = tuple(at.T), tuple((at + along).T)
+        share = distance[start] / (distance[start] - distance[end])
+        points.append(grid[start] + share[:, None] * (grid[end] - grid[start]))
+        around = at[:, None] - np.array([first + second, second, np.zeros(3, int), first])
+        legal_start = distance[start] >= 0
+        around[legal_start] = around[legal_start][:, ::-1]
+        cells.append(around)
+    return np.concatenate(points), np.concatenate(cells)
 
 
 def _survey(contact: Contact, stage: Stage, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -165,23 +164,6 @@ def _build_grid(low: np.ndarray, high: np.ndarray, cells: np.ndarray) -> np.ndar
     """Points `(*(cells + 1), dim)` of a grid over a box."""
     axes = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, cells, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-
-
-def _others(axis: int) -> tuple[int, int]:
-    """The two axes after another, in the cycle x, y, z: (axis, first, second) is right-handed."""
-    return (axis + 1) % 3, (axis + 2) % 3
-
-
-def _slice(array: np.ndarray, axis: int, part: slice) -> np.ndarray:
-    return array[(slice(None),) * axis + (part,)]
-
-
-def _around(axis: int, parts: list[slice]) -> tuple[slice, ...]:
-    """An index that takes everything along an axis, and these parts along the two after it."""
-    index = [slice(None)] * 3
-    for i, part in zip(_others(axis), parts, strict=True):
-        index[i] = part
-    return tuple(index)
 
 
 def _as_float64(contact: Contact) -> Contact:

@@ -92,10 +92,11 @@ def draw_in_space(ax: "Axes3D", stage: Stage, contacts: tuple[Contact, ...], t: 
         else:
             # of a bowl or a cave only what is seen from its legal side: the near wall would hide what is in it
             open_side = outline.normals @ _find_eye(ax, up) > 0
-            polygons = outline.polygons[open_side]
+            polygons = [polygon for polygon, is_open in zip(outline.polygons, open_side, strict=True) if is_open]
             look = {"facecolors": _shade(outline.normals[open_side], GREY, up), "linewidths": 0, "alpha": BENT_OPACITY}
-        drawn.append(Poly3DCollection(polygons, zorder=0, **look))
-        ax.add_collection3d(drawn[-1])
+        if len(polygons):  # matplotlib cannot add a collection of nothing in space
+            drawn.append(Poly3DCollection(polygons, zorder=0, **look))
+            ax.add_collection3d(drawn[-1])
     return drawn
 
 
@@ -111,6 +112,8 @@ def draw_solids(ax: "Axes3D", stage: Stage, contacts: tuple[Contact, ...], t: fl
 
     drawn = []
     for solid in find_solids(stage, contacts, t):
+        if not len(solid.outline.polygons):
+            continue
         lit = shade_solid(solid, up)
         drawn.append(Poly3DCollection(solid.outline.polygons, facecolors=lit, edgecolors=lit, linewidths=0.3, zorder=1))
         ax.add_collection3d(drawn[-1])

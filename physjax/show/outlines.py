@@ -68,11 +68,31 @@ def build_outline(contact: Contact, stage: Stage, t: float, cells: int = PICTURE
         return known.outline(contact, stage, t)
     vertices, faces = level_sets.extract_level_set(contact, stage, t, cells)
     patches = vertices[faces]
-    patches = patches[stage.contains(patches).all(axis=1)]
     across = np.cross(patches[:, 2] - patches[:, 0], patches[:, 3] - patches[:, 1])
     length = np.sqrt((across * across).sum(axis=-1, keepdims=True))
-    seen = length[:, 0] > 0
-    return Outline(patches[seen], across[seen] / length[seen], level_sets.is_bounded(contact, stage, t))
+    # faces that are not wholly beyond one side of the box; of those few reach out of it
+    near = ((patches.max(axis=1) >= stage.low) & (patches.min(axis=1) <= stage.high)).all(axis=-1) & (length[:, 0] > 0)
+    patches, normals = patches[near], across[near] / length[near]
+    whole = ((patches >= stage.low) & (patches <= stage.high)).all(axis=(1, 2))
+    polygons = [*patches[whole], *(_clip_to_box(patch, stage) for patch in patches[~whole])]
+    return Outline(
+        polygons, np.concatenate([normals[whole], normals[~whole]]), level_sets.is_bounded(contact, stage, t)
+    )
+
+
+def _clip_to_box(polygon: np.ndarray, stage: Stage) -> np.ndarray:
+    """The part of a convex polygon `(corners, 3)` that is in the box; without corners if none is."""
+    for axis, side in product(range(3), (1.0, -1.0)):
+        # Sutherland and Hodgman: side by side of the box, keep the corners on its inner side and the points in between
+        room = side * ((stage.high if side > 0 else stage.low)[axis] - polygon[:, axis])
+        corners = []
+        for start, end, a, b in zip(polygon, [*polygon[1:], *polygon[:1]], room, [*room[1:], *room[:1]], strict=True):
+            if a >= 0:
+                corners.append(start)
+            if (a < 0) != (b < 0):
+                corners.append(start + a / (a - b) * (end - start))
+        polygon = np.array(corners).reshape(-1, 3)
+    return polygon
 
 
 def find_hidden_points(contact: Contact, outline: Outline, stage: Stage, t: float, points: np.ndarray, eye: np.ndarray):

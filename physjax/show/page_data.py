@@ -18,9 +18,9 @@ HIDDEN_CODE = -32768
 """Stands for a position outside of the box, or for none: nothing that is joined to it is drawn."""
 PAGE_CELLS = 48
 """Cells along the longest side of the box for a surface drawn from its signed distance: some 8 000 faces, which a page
-turns without effort."""
+turns without effort. One that moves is sent many times and has `outlines.PICTURE_CELLS`."""
 MAX_OBSTACLE_STATES = 60
-"""A surface that changes in no simple way is sent at most this many times, at some 30 kB each; in between it stays."""
+"""A surface that changes in no simple way is sent at most this many times, at some 20 kB each; in between it stays."""
 
 
 def pack_frames(array: np.ndarray) -> str:
@@ -46,11 +46,13 @@ def build_padded_box(scenery: Scenery) -> tuple[np.ndarray, np.ndarray]:
 def describe_obstacle(contact: Contact, scenery: Scenery, frames: list[int]) -> dict[str, Any]:
     """A ball; flat sheets, where they are at a time `since` and how fast they move on; or meshes, each from a frame on."""
     stage, times = scenery.stage, scenery.run.time[frames]
-    first = outlines.build_outline(contact, stage, times[0], PAGE_CELLS)
+    first = outlines.build_outline(contact, stage, times[0])
     if first.velocity is None:
         moves = level_sets.moves(contact, stage, times)
         if first.normals is None and not moves:
             return _describe_sheets(first, times[0])
+        if not moves:
+            first = outlines.build_outline(contact, stage, times[0], PAGE_CELLS)
         return _describe_meshes(contact, first, scenery, frames, moves)
     if first.ball is not None:
         ball = {"center": first.ball.center.tolist(), "radius": first.ball.radius, "inside": not first.solid}
@@ -83,11 +85,11 @@ def _describe_meshes(
     for number in chosen.tolist():
         outline = first
         if number:
-            outline = outlines.build_outline(contact, scenery.stage, scenery.run.time[frames[number]], PAGE_CELLS)
+            outline = outlines.build_outline(contact, scenery.stage, scenery.run.time[frames[number]])
         vertices, faces = _triangulate(outline)
         places = pack_frames(quantise_positions(scenery, vertices))
         states.append({"frame": number, "places": places, "faces": pack_frames(faces.astype(np.int32))})
-    return {"kind": "mesh", "solid": first.solid, "states": states}
+    return {"kind": "mesh", "solid": first.solid, "one_sided": first.normals is not None, "states": states}
 
 
 def _triangulate(outline: Outline) -> tuple[np.ndarray, np.ndarray]:
@@ -95,6 +97,9 @@ def _triangulate(outline: Outline) -> tuple[np.ndarray, np.ndarray]:
     if not len(outline.polygons):
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     vertices, numbers = np.unique(np.concatenate(list(outline.polygons)), axis=0, return_inverse=True)
-    corners = np.split(numbers.ravel(), np.cumsum([len(polygon) for polygon in outline.polygons])[:-1])
-    fans = [np.stack([np.full(len(c) - 2, c[0]), c[1:-1], c[2:]], axis=1) for c in corners]
-    return vertices, np.concatenate(fans)
+    count = np.array([len(polygon) for polygon in outline.polygons])
+    starts, fans = np.cumsum(count) - count, []
+    for corner in range(1, count.max(initial=0) - 1):
+        first = starts[count > corner + 1]
+        fans.append(np.stack([first, first + corner, first + corner + 1], axis=1))
+    return vertices, numbers.ravel()[np.concatenate(fans)]
