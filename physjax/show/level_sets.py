@@ -19,6 +19,8 @@ from physjax.show.stage import NEAR_FLOOR_SHARE, REACH_SHARE, Stage
 
 SURVEY_CELLS = {2: 64, 3: 24}
 """Cells along a side of the grid on which a surface is looked for, by the number of dimensions: 4 225 and 15 625 points."""
+REFINEMENTS = 2
+"""Finer surveys of what the first has found: its ends are then known to a few thousandths of its size."""
 PROJECTION_STEPS = 3
 """Newton steps that bring a vertex onto the surface; each squares the error, which starts at a fraction of a cell."""
 MOTION_SAMPLES = 16
@@ -86,20 +88,17 @@ def moves(contact: Contact, stage: Stage, times: np.ndarray) -> bool:
 
 
 def is_bounded(contact: Contact, stage: Stage, t: float) -> bool:
-    """Whether it is an obstacle that ends within reach of the picture: something solid, not a floor or a container."""
-    _, distance = _survey(contact, stage, t)
-    return (distance < 0).any() and not _meets_border(distance < 0)
+    """Whether an obstacle ends within reach of the picture: something solid, not a floor or a container."""
+    _, distance = _survey(contact, t, *_find_reach(stage))
+    return not _meets_border(distance < 0)
 
 
 def find_corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:
     """Points that belong into the picture: the ends of an obstacle or of a container, or the nearest point of a floor."""
-    points, distance = _survey(contact, stage, t)
-    cell = 2 * REACH_SHARE * max(stage.size, 1e-12) / SURVEY_CELLS[len(stage.low)]
-    for side in (distance < 0, distance > 0):
-        if side.any() and not _meets_border(side):
-            # a ball of the distance around a point of one side lies on that side as well
-            radius = np.minimum(np.abs(distance[side]), cell)[:, None]
-            return [(points[side] - radius).min(axis=0), (points[side] + radius).max(axis=0)]
+    for sign in (1.0, -1.0):  # obstacles have a wrong side that ends, containers a legal one
+        ends = _find_ends(contact, t, sign, *_find_reach(stage))
+        if ends is not None:
+            return list(ends)
     grid = _build_grid(stage.low, stage.high, np.full(len(stage.low), 4)).reshape(-1, len(stage.low))
     distance = evaluate_distance(contact, t, grid)
     nearest = distance.argmin()
@@ -149,10 +148,39 @@ def _find_cut_edges(grid: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray,
     return np.concatenate(points), np.concatenate(cells)
 
 
-def _survey(contact: Contact, stage: Stage, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points on a grid as far as the picture may reach, and their distances."""
+def _find_ends(
+    contact: Contact, t: float, sign: float, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The box [m] around the places where sign times the distance is negative; None if there are none or they go on."""
+    found = None
+    for _ in range(1 + REFINEMENTS):
+        points, distance = _survey(contact, t, low, high)
+        distance, cell = sign * distance, (high - low).max() / SURVEY_CELLS[len(low)]
+        inside = distance < 0
+        if found is None and _meets_border(inside):
+            return None
+        if not inside.any():
+            if distance.min() > cell:
+                return found
+            nearest = points.reshape(-1, len(low))[distance.argmin()]  # something smaller than a cell
+            low, high = nearest - 2 * cell, nearest + 2 * cell
+            continue
+        # a ball of the distance around a point of one side lies on that side as well
+        radius = np.minimum(np.abs(distance[inside]), cell)[:, None]
+        found = (points[inside] - radius).min(axis=0), (points[inside] + radius).max(axis=0)
+        low, high = found[0] - cell, found[1] + cell
+    return found
+
+
+def _find_reach(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """The box of all that may make the picture larger."""
     middle, reach = (stage.low + stage.high) / 2, REACH_SHARE * max(stage.size, 1e-12)
-    points = _build_grid(middle - reach, middle + reach, np.full(len(middle), SURVEY_CELLS[len(middle)]))
+    return middle - reach, middle + reach
+
+
+def _survey(contact: Contact, t: float, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on a grid over a box, and their distances."""
+    points = _build_grid(low, high, np.full(len(low), SURVEY_CELLS[len(low)]))
     return points, evaluate_distance(contact, t, points)
 
 

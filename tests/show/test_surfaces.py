@@ -42,7 +42,9 @@ def test_every_face_is_drawn_at_every_frame_that_was_asked_for(drape):
     for ax in figure.axes:
         assert polygons(ax) == len(sheet.faces) == 40
         assert polygons(ax, zorders=(3,)) == len(
-            obstacles.find_solids(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[0].outline.polygons
+            obstacles.find_solids(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[
+                0
+            ].outline.polygons
         )
         assert polygons(ax, zorders=(0,)) == 1  # the floor
         assert len(ax.collections) <= 4  # however many faces
