@@ -74,12 +74,15 @@ def _format_arcs(aimed: "Aimed", any_speed: bool) -> str:
 
 def _build_throw(options: argparse.Namespace) -> "Scene":
     """A point mass at rest at the start, under gravity and, if asked for, drag."""
+    import numpy as np
+
     from physjax.particles import Particles
+    from physjax.parts import Force
     from physjax.physics import forces
     from physjax.scene import Scene
 
     dim = len(options.target)
-    start = options.start or [0.0] * dim
+    start = np.array(options.start or [0.0] * dim)
     for name, given in (("start", start), ("wind", options.wind)):
         if given is not None and len(given) != dim:
             raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
@@ -87,7 +90,7 @@ def _build_throw(options: argparse.Namespace) -> "Scene":
         raise ValueError("--wind: got a wind without --drag, expected both: the air acts through the drag.")
     if options.up == "z" and dim == 2:
         raise ValueError("--up: got z with a target in the plane, expected x or y, or a third number for --target.")
-    loads = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
+    loads: list[Force] = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
     if options.drag is not None:
         loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
-    return Scene(Particles(start, [0.0] * dim), mass=options.mass, forces=tuple(loads))
+    return Scene(Particles(start, np.zeros(dim)), mass=options.mass, forces=tuple(loads))

@@ -1,7 +1,7 @@
 """A run drawn by what its scene holds: a surface, bodies, springs between nodes, or particles with their paths."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
 MIN_PLAY_SECONDS, MAX_PLAY_SECONDS = 2.0, 5.0
 """A film plays in real time if it then lasts this long [s], and faster or slower otherwise."""
@@ -69,20 +70,19 @@ def _draw_paths(film: Trajectory) -> "Figure":
 
     run = take_lanes("plot_run", film)
     if run.dim == 1:
-        return plot.paths(film, every=_lane_stride(film)).figure
+        return cast("Figure", plot.paths(film, every=_lane_stride(film)).figure)
     figure = plt.figure()
     scenery = build_scenery(run, list(range(run.good_frames)))
     (ax,) = arrange_panels(figure, scenery, 1)
     scenery.draw_obstacles(ax, 0)
-    if not scenery.flat:
-        scenery.draw_solids(ax, 0)
+    scenery.draw_solids(ax, 0)
     plot.paths(film, every=_lane_stride(film), ax=ax)
     # drawing paths sets the limits anew: back to those of the stage
     ax.set(**{f"{name}lim": ends for name, *ends in zip("xyz", *scenery.stage, strict=False)})
     if scenery.flat:
         ax.set_aspect("equal", adjustable="box")
     else:
-        ax.set_box_aspect(scenery.stage.high - scenery.stage.low)
+        cast("Axes3D", ax).set_box_aspect(scenery.stage.high - scenery.stage.low)
     ax.title.set_text("")
     return figure
 

@@ -65,16 +65,16 @@ def choose_drawable(
     if shown is None and isinstance(film, Trajectory) and film.scene is not None and film.state is not None:
         shown = find_default_look(film)
     # a lattice is a tuple as well
-    bodies = isinstance(shown, Shape) or (isinstance(shown, list | tuple) and not isinstance(shown, Lattice))
-    if scene is not None and (shown is None or bodies):
+    bodies = shown if isinstance(shown, Shape | list | tuple) and not isinstance(shown, Lattice) else None
+    if scene is not None and (shown is None or bodies is not None):
         raise ValueError(
             f"{who}: got scene={scene}, expected none: all lanes are drawn side by side. It picks one of a batch of "
             "cloths, ropes or other lattices."
         )
     if shown is None:
         return Dots(take_lanes(who, film, dims))
-    if bodies:
-        return Bodies(*check_shapes(who, film, shown))
+    if bodies is not None:
+        return Bodies(*check_shapes(who, film, bodies))
     if isinstance(shown, Lattice) and len(shown.faces):
         faces, nodes = get_faces(who, shown)
         return Surface(take_frames(who, film, scene=scene, nodes=nodes, dims=dims), faces)
@@ -84,7 +84,10 @@ def choose_drawable(
 
 def find_default_look(film: Trajectory) -> Look | None:
     """What the scene of a film is drawn as: boxes for bodies, its springs (not those of a line), or None."""
+    scene = film.scene
+    if scene is None:
+        return None
     if isinstance(film.state, RigidBodies):
-        return [build_inertia_box(film.scene.mass, lane) for lane in np.ndindex(film.scene.state.position.shape[:-1])]
-    springs = [force for force in film.scene.forces if isinstance(force, Springs)]
+        return [build_inertia_box(scene.mass, lane) for lane in np.ndindex(scene.state.position.shape[:-1])]
+    springs = [force for force in scene.forces if isinstance(force, Springs)]
     return springs[0] if springs and film.position.shape[-1] > 1 else None

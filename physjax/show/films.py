@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from physjax.show.panels import Scenery, arrange_panels
 from physjax.text import progress_bar
 
 if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL.Image import Image
 
@@ -128,7 +129,7 @@ class Film:
 
         return figure, show
 
-    def _write_gif(self, file: BinaryIO, progress: bool) -> None:
+    def _write_gif(self, file: IO[bytes], progress: bool) -> None:
         pictures = self._render_pictures(progress)
         next(pictures).save(
             file,
@@ -142,12 +143,14 @@ class Film:
 
     def _render_pictures(self, progress: bool) -> "Iterator[Image]":
         """The pictures, in the 256 colours that all of them share."""
+        from PIL.Image import Dither
+
         figure, show = self._build_renderer()
         palette = _build_palette(
             [_render_picture(figure, show, self.frames[int(i)]) for i in np.linspace(0, len(self.frames) - 1, 3)]
         )
         for frame in _track_progress(self.frames, progress):
-            yield _render_picture(figure, show, frame).quantize(palette=palette, dither=0)
+            yield _render_picture(figure, show, frame).quantize(palette=palette, dither=Dither.NONE)
 
     def _compute_durations(self) -> list[int]:
         """How long each picture is shown [ms]: whole hundredths of a second that add up to real time."""
@@ -206,7 +209,7 @@ def _render_picture(figure: "Figure", show: Callable[[int], None], frame: int) -
 
     show(frame)
     figure.canvas.draw()
-    return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+    return Image.fromarray(np.asarray(cast("FigureCanvasAgg", figure.canvas).buffer_rgba())[..., :3].copy())
 
 
 def _encode_webp(picture: "Image", **options: bool | int) -> bytes:
@@ -224,7 +227,8 @@ def _build_palette(pictures: "list[Image]") -> "Image":
     for place, picture in enumerate(pictures):
         together.paste(picture, (0, place * height))
     # Pillow takes any colour that is close enough: one that is almost grey would be taken for the greys of the axes
-    found = np.array(together.quantize(256 - GREY_COUNT).getpalette()[: 3 * (256 - GREY_COUNT)]).reshape(-1, 3)
+    wanted = 256 - GREY_COUNT
+    found = np.array((together.quantize(wanted).getpalette() or [])[: 3 * wanted]).reshape(-1, 3)
     colours = found[np.ptp(found, axis=1) > GREY_CHANNEL_SPREAD]
     greys = np.repeat(np.linspace(0, 255, GREY_COUNT).round().astype(int), 3)
     palette = Image.new("P", (1, 1))

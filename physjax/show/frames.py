@@ -69,7 +69,7 @@ def take_frames(
             f"{who}: got a film of {position.shape[1]} nodes and a sheet of {nodes}, expected the same number. "
             "Give the lattice the film's scene was made from."
         )
-    whole = np.isfinite(position).all(axis=-1).all(axis=-1)
+    whole = np.isfinite(position).all(axis=(-2, -1))
     return _build_frames(who, film, time, position, whole, dims)
 
 

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import ENTRY_AXIS_COUNT
@@ -27,7 +28,7 @@ MOTION_SAMPLES = 16
 """Moments at which a surface is compared with itself to see whether it moves."""
 
 
-def evaluate_distance(contact: Contact, t: float, points: np.ndarray) -> np.ndarray:
+def evaluate_distance(contact: Contact, t: float | np.floating, points: np.ndarray) -> np.ndarray:
     """Signed distance [m] of points `(..., dim)` at a time; infinite where it is not a number."""
     contact, flat = _as_float64(contact), np.asarray(points, float).reshape(-1, points.shape[-1])
     with jax.enable_x64(True):
@@ -199,13 +200,13 @@ def _as_float64(contact: Contact) -> Contact:
 
 
 @eqx.filter_jit
-def _distance(contact: Contact, t: Float[Array, ""], points: Float[Array, "n dim"]) -> Float[Array, " n"]:
+def _distance(contact: Contact, t: ArrayLike, points: ArrayLike) -> Float[Array, " n"]:
     return contact.signed_distance(t, points)
 
 
 @eqx.filter_jit
 def _distance_and_gradient(
-    contact: Contact, t: Float[Array, ""], points: Float[Array, "n dim"]
+    contact: Contact, t: ArrayLike, points: ArrayLike
 ) -> tuple[Float[Array, " n"], Float[Array, "n dim"]]:
     # points are independent, so the gradient of the sum holds the gradient of each
     slope = jax.grad(lambda x: jnp.sum(contact.signed_distance(t, x)))(points)

@@ -1,12 +1,15 @@
 """Images of many particles at once: light that adds up, and how many particles there are in a place."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+
+from physjax.show.stage import get_space_axes
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
 
 CELL_POINTS = 2.0
 """Width of a cell in which particles are counted [points]."""
@@ -24,7 +27,7 @@ def project_to_pixels(ax: "Axes", position: np.ndarray) -> np.ndarray:
     if position.shape[-1] == 3:
         from mpl_toolkits.mplot3d import proj3d
 
-        position = np.stack(proj3d.proj_transform(*position.T, ax.get_proj())[:2], axis=-1)
+        position = np.stack(proj3d.proj_transform(*position.T, cast("Axes3D", ax).get_proj())[:2], axis=-1)
     return ax.transData.transform(position) - (ax.bbox.x0, ax.bbox.y0)
 
 
@@ -38,7 +41,7 @@ def darken_background(ax: "Axes", flat: bool) -> None:
     if flat:
         ax.set_facecolor(NIGHT_COLOUR)
         return
-    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+    for axis in get_space_axes(cast("Axes3D", ax)):
         axis.set_pane_color((*NIGHT_COLOUR, 1.0))
         axis._axinfo["grid"].update(color="0.3", linewidth=0.5)
 

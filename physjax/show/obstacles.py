@@ -20,7 +20,6 @@ from physjax.show.stage import REACH_SHARE, Stage
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.contour import QuadContourSet
     from mpl_toolkits.mplot3d import Axes3D
 
 GREY, STONE = "#9AA3AD", "#C9CDD2"
@@ -47,7 +46,9 @@ def select_shared_surfaces(contacts: tuple[Contact, ...], dim: int = 3) -> tuple
     return tuple(surface for surface in surfaces if level_sets.is_shared(surface, dim))
 
 
-def include_obstacles(stage: Stage, contacts: tuple[Contact, ...], times: Sequence[float] = (0.0,)) -> Stage:
+def include_obstacles(
+    stage: Stage, contacts: tuple[Contact, ...], times: Sequence[float] | np.ndarray = (0.0,)
+) -> Stage:
     """The box with obstacles and rooms inside, at those times, and with floors that are near; far larger ones do not count."""
     low, high = stage
     for contact, t in product(contacts, times):
@@ -62,7 +63,7 @@ def any_moves(contacts: tuple[Contact, ...], stage: Stage, times: np.ndarray) ->
     return any(level_sets.moves(contact, stage, times) for contact in contacts)
 
 
-def draw_flat(ax: "Axes", stage: Stage, contacts: tuple[Contact, ...], t: float) -> "list[QuadContourSet]":
+def draw_flat(ax: "Axes", stage: Stage, contacts: tuple[Contact, ...], t: float) -> "list[Artist]":
     """The wrong side of each contact in the plane, shaded, and its edge."""
     x, y = (np.linspace(low, high, CONTOUR_POINTS) for low, high in zip(*stage, strict=True))
     points = np.stack(np.meshgrid(x, y), axis=-1)

@@ -38,7 +38,7 @@ class Outline(NamedTuple):
     `velocity` [m/s] moves on as it is; one without has to be asked for at every time.
     """
 
-    polygons: Sequence[np.ndarray]
+    polygons: Sequence[np.ndarray] | np.ndarray
     normals: np.ndarray | None = None
     solid: bool = False
     ball: Ball | None = None

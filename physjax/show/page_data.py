@@ -12,6 +12,8 @@ from physjax.show.outlines import Outline
 from physjax.show.panels import Scenery
 from physjax.show.stage import EDGE_SLACK_SHARE
 
+Json = dict[str, Any]
+"""An object of the page's JSON."""
 QUANTISATION_STEPS = 32767
 """A position is one of this many steps to either side of the middle of the box, along each of its sides."""
 HIDDEN_CODE = -32768
@@ -43,7 +45,7 @@ def build_padded_box(scenery: Scenery) -> tuple[np.ndarray, np.ndarray]:
     return scenery.stage.low - slack, scenery.stage.high + slack
 
 
-def describe_obstacle(contact: Contact, scenery: Scenery, frames: list[int]) -> dict[str, Any]:
+def describe_obstacle(contact: Contact, scenery: Scenery, frames: list[int]) -> Json:
     """A ball; flat sheets, where they are at a time `since` and how fast they move on; or meshes, each from a frame on."""
     stage, times = scenery.stage, scenery.run.time[frames]
     first = outlines.build_outline(contact, stage, times[0])
@@ -65,7 +67,7 @@ def describe_obstacle(contact: Contact, scenery: Scenery, frames: list[int]) -> 
     return _describe_sheets(first, times[0])
 
 
-def _describe_sheets(outline: Outline, since: float) -> dict[str, Any]:
+def _describe_sheets(outline: Outline, since: float) -> Json:
     sheets = [polygon.tolist() for polygon in outline.polygons]
     return {"kind": "sheets", "sheets": sheets, "since": float(since), "velocity": _spread_velocity(outline)}
 
@@ -75,9 +77,7 @@ def _spread_velocity(outline: Outline) -> list[float]:
     return np.broadcast_to(velocity, 3).tolist()
 
 
-def _describe_meshes(
-    contact: Contact, first: Outline, scenery: Scenery, frames: list[int], moves: bool
-) -> dict[str, Any]:
+def _describe_meshes(contact: Contact, first: Outline, scenery: Scenery, frames: list[int], moves: bool) -> Json:
     """A surface as triangles, once or, if it moves, at moments spread evenly over the frames."""
     count = min(len(frames), MAX_OBSTACLE_STATES) if moves else 1
     chosen = np.linspace(0, len(frames), count, endpoint=False).astype(int)
@@ -85,7 +85,7 @@ def _describe_meshes(
     for number in chosen.tolist():
         outline = first
         if number:
-            outline = outlines.build_outline(contact, scenery.stage, scenery.run.time[frames[number]])
+            outline = outlines.build_outline(contact, scenery.stage, float(scenery.run.time[frames[number]]))
         vertices, faces = _triangulate(outline)
         places = pack_frames(quantise_positions(scenery, vertices))
         states.append({"frame": number, "places": places, "faces": pack_frames(faces.astype(np.int32))})

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from physjax.show.stage import Stage, build_stage, create_axes
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
@@ -58,11 +59,13 @@ class Scenery(NamedTuple):
         """Draw the surfaces at a frame, behind what moves; in space those that hide nothing."""
         if self.flat:
             return obstacles.draw_flat(ax, self.stage, self.contacts, self.run.time[frame])
-        return obstacles.draw_in_space(ax, self.stage, self.contacts, self.run.time[frame], self.up)
+        return obstacles.draw_in_space(cast("Axes3D", ax), self.stage, self.contacts, self.run.time[frame], self.up)
 
-    def draw_solids(self, ax: "Axes3D", frame: int) -> "list[Artist]":
-        """Draw the surfaces in space that hide what is behind them."""
-        return obstacles.draw_solids(ax, self.stage, self.contacts, self.run.time[frame], self.up)
+    def draw_solids(self, ax: "Axes", frame: int) -> "list[Artist]":
+        """Draw the surfaces in space that hide what is behind them; in the plane nothing does."""
+        if self.flat:
+            return []
+        return obstacles.draw_solids(cast("Axes3D", ax), self.stage, self.contacts, self.run.time[frame], self.up)
 
 
 def build_scenery(run: Frames, frames: Sequence[int]) -> Scenery:
@@ -97,7 +100,7 @@ def arrange_panels(figure: "Figure", scenery: Scenery, count: int, bar: Callable
     if scenery.flat:
         _fit_flat_panels(figure, drawn, scenery.stage, (rows, columns), (above, below))
     else:
-        _fit_boxes(figure, drawn, (rows, columns), (above, below))
+        _fit_boxes(figure, cast("list[Axes3D]", drawn), (rows, columns), (above, below))
     if bar is not None:
         height = figure.get_size_inches()[1]
         bar(
@@ -153,7 +156,8 @@ def _fit_boxes(figure: "Figure", drawn: "list[Axes3D]", grid: tuple[int, int], m
             _clear_labels(ax)
     width = FIGURE_WIDTH_INCHES if columns > 1 else 5.6
     figure.set_size_inches(width, width)
-    side = width / columns
+    side, step, needed = width / columns, 0.0, width
+    box, left, top, bottom = [0.0] * 4, 0.0, 0.0, 0.0
     for _ in range(FIT_PASSES):
         drawn[0].set_position((0, 0, side / width, side / width))
         figure.draw_without_rendering()
@@ -182,7 +186,7 @@ def _clear_labels(ax: "Axes3D") -> None:
 
 def _measure_labelled_box(figure: "Figure", ax: "Axes3D", box: list[float]) -> np.ndarray:
     """Left, lower, right and upper end of a box with its labels [inches]."""
-    renderer = figure.canvas.get_renderer()
+    renderer = cast("FigureCanvasAgg", figure.canvas).get_renderer()
     labels = [axis.get_tightbbox(renderer).extents / figure.dpi for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
     ends = np.array([box, *labels])
     return np.concatenate([ends[:, :2].min(axis=0), ends[:, 2:].max(axis=0)])

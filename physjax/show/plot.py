@@ -3,7 +3,7 @@
 Every function returns matplotlib axes or a figure and accepts one to draw into. matplotlib is imported when first used.
 """
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -21,6 +21,7 @@ from physjax.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
 __all__ = [
     "bodies",
@@ -94,7 +95,7 @@ def draw_paths(
     if ax is None:
         ax = plt.figure(figsize=(6, 4), layout="constrained").add_subplot(projection="3d" if dim == 3 else None)
         if dim == 3:
-            ax.view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="xyz"[up])
+            cast("Axes3D", ax).view_init(elev=ELEVATION, azim=AZIMUTH, vertical_axis="xyz"[up])
     count = position.shape[1]
     shade = np.arange(count) if color is None else np.asarray(color).ravel()[::every]
     span = np.ptp(shade) or 1.0
@@ -111,7 +112,7 @@ def draw_paths(
         ax.set(xlabel="x [m]", ylabel="y [m]")
         ax.set_aspect("equal", adjustable="datalim")
         if dim == 3:
-            ax.set_zlabel("z [m]")
+            cast("Axes3D", ax).set_zlabel("z [m]")
     return ax
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 STRAIN_PERCENTILE = 99.0
@@ -140,8 +141,8 @@ def draw_springs(ax: "Axes", scenery: Scenery, frame: int, *, spring_lines: Spri
     if broken.any():
         drawn.append(_build_collection(ends[broken], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2))
     for collection in drawn:
-        (ax.add_collection if scenery.flat else ax.add_collection3d)(collection)
-    return drawn if scenery.flat else drawn + scenery.draw_solids(ax, frame)
+        (ax.add_collection if scenery.flat else cast("Axes3D", ax).add_collection3d)(collection)
+    return [*drawn, *scenery.draw_solids(ax, frame)]
 
 
 def draw_strain_bar(figure: "Figure", where: dict[str, Any], *, spring_lines: SpringLines) -> None:
@@ -154,7 +155,7 @@ def _build_collection(ends: np.ndarray, **style: Any) -> "LineCollection | Line3
     if ends.shape[-1] == 2:
         from matplotlib.collections import LineCollection
 
-        return LineCollection(ends, **style)
+        return LineCollection(list(ends), **style)
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     return Line3DCollection(ends, **style)

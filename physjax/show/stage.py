@@ -1,7 +1,7 @@
 """Axes in metres: up as in the scene, one scale in all directions, and limits that stay the same from frame to frame."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d import Axes3D
+    from mpl_toolkits.mplot3d.axis3d import Axis as SpaceAxis
 
 ELEVATION, AZIMUTH = 16.0, 28.0
 """The direction from which space is seen [degrees]: the height above the ground, and the turn about the axis that is up,
@@ -72,7 +73,7 @@ def create_axes(figure: "Figure", place: tuple[int, int, int], stage: Stage, up:
     """Axes for a box in the plane or in space, with the axis `up` upright; nothing that is drawn changes their limits."""
     flat = len(stage.low) == 2
     ax = figure.add_subplot(*place, projection=None if flat else "3d")
-    axes = (ax.xaxis, ax.yaxis) if flat else (ax.xaxis, ax.yaxis, ax.zaxis)
+    axes = (ax.xaxis, ax.yaxis) if flat else (ax.xaxis, ax.yaxis, cast("Axes3D", ax).zaxis)
     for axis, name, low, high in zip(axes, "xyz"[: len(axes)], stage.low, stage.high, strict=True):
         ax.set(**{f"{name}lim": (low, high), f"{name}label": f"{name} [m]"})
         axis.set_major_locator(_choose_ticks((high - low) / stage.size, 2 if flat else 1))
@@ -83,7 +84,7 @@ def create_axes(figure: "Figure", place: tuple[int, int, int], stage: Stage, up:
         for edge in ax.spines.values():
             edge.set_color("0.75")
     else:
-        _style_space_axes(ax, stage, up)
+        _style_space_axes(cast("Axes3D", ax), stage, up)
     return ax
 
 
@@ -93,7 +94,7 @@ def _style_space_axes(ax: "Axes3D", stage: Stage, up: int) -> None:
     ax.set_proj_type("persp", focal_length=1.6)
     ax.computed_zorder = False  # by layers: sorted by depth, a floor would come before the cloth on it
     ax.patch.set_visible(False)  # boxes reach into their neighbours' axes
-    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+    for axis in get_space_axes(ax):
         axis.set_pane_color((0.98, 0.98, 0.985, 1.0))
         axis.line.set_color("0.75")
         axis._axinfo["grid"].update(color="0.9", linewidth=0.6)
@@ -102,6 +103,11 @@ def _style_space_axes(ax: "Axes3D", stage: Stage, up: int) -> None:
         axis.labelpad = 2
         axis.label.set_fontsize(8.5)
     ax.set_box_aspect(stage.high - stage.low, zoom=1.0)
+
+
+def get_space_axes(ax: "Axes3D") -> "list[SpaceAxis]":
+    """The three axes of axes in space; matplotlib's own types know only those of the plane."""
+    return cast("list[SpaceAxis]", [ax.xaxis, ax.yaxis, ax.zaxis])
 
 
 def _choose_ticks(share: float, fewest: int) -> "MaxNLocator":

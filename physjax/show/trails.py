@@ -1,7 +1,7 @@
 """Particles as dots, each with the last part of its path behind it."""
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
 MAX_TRAIL_PIECES = 16
 """A trail has at most this many straight pieces: more are not seen, and each is drawn in every picture."""
@@ -30,18 +31,18 @@ class Trails(NamedTuple):
         from matplotlib.collections import LineCollection
 
         position = scenery.position(frame)
-        alive = np.isfinite(position).all(axis=-1)
+        alive: np.ndarray = np.isfinite(position).all(axis=-1)
         # the area of a dot [points²]: about the same ink, however many there are
         dots = dict(c=self.colours[alive], s=float(np.clip(4000 / len(alive), 5, 45)), linewidths=0, zorder=4)
         pieces, colours = self._build_pieces(scenery.run, frame)
         if scenery.flat:
-            trail = ax.add_collection(LineCollection(pieces, colors=colours, linewidths=1.2, zorder=3))
+            trail = ax.add_collection(LineCollection(list(pieces), colors=colours, linewidths=1.2, zorder=3))
             return [trail, ax.scatter(*position[alive].T, **dots)]
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
         # matplotlib cannot add a collection of nothing in space
         lines = [Line3DCollection(pieces, colors=colours, linewidths=1.2, zorder=3)] if len(pieces) else []
-        trail = [ax.add_collection3d(line) for line in lines]
+        trail = [cast("Axes3D", ax).add_collection3d(line) for line in lines]
         return [*trail, ax.scatter(*position[alive].T, depthshade=True, **dots), *scenery.draw_solids(ax, frame)]
 
     def _build_pieces(self, run: Frames, frame: int) -> tuple[np.ndarray, np.ndarray]:

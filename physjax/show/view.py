@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -21,6 +21,7 @@ from physjax.show.films import schedule
 from physjax.show.frames import find_batch_index
 from physjax.show.page_data import (
     QUANTISATION_STEPS,
+    Json,
     build_padded_box,
     describe_obstacle,
     pack_frames,
@@ -36,9 +37,6 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.typing import ColorType
-
-Json = dict[str, Any]
-"""An object of the page's JSON."""
 
 NOTEBOOK_HEIGHT_PIXELS = 560
 """Height of the page inside a notebook [pixels]."""
