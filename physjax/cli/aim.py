@@ -74,7 +74,7 @@ def _format_arcs(aimed: "Aimed", any_speed: bool) -> str:
 
 def _build_throw(options: argparse.Namespace) -> "Scene":
     """A point mass at rest at the start, under gravity and, if asked for, drag."""
-    import numpy as np
+    import jax.numpy as jnp
 
     from physjax.particles import Particles
     from physjax.parts import Force
@@ -82,7 +82,7 @@ def _build_throw(options: argparse.Namespace) -> "Scene":
     from physjax.scene import Scene
 
     dim = len(options.target)
-    start = np.array(options.start or [0.0] * dim)
+    start = jnp.array(options.start or [0.0] * dim)
     for name, given in (("start", start), ("wind", options.wind)):
         if given is not None and len(given) != dim:
             raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
@@ -93,4 +93,4 @@ def _build_throw(options: argparse.Namespace) -> "Scene":
     loads: list[Force] = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
     if options.drag is not None:
         loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
-    return Scene(Particles(start, np.zeros(dim)), mass=options.mass, forces=tuple(loads))
+    return Scene(Particles(start, jnp.zeros(dim)), mass=options.mass, forces=tuple(loads))

@@ -3,14 +3,14 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from tqdm import tqdm
 
 if TYPE_CHECKING:
     from physjax.particles import Particles
-    from physjax.physics.rigid.spatial import RigidBodies
     from physjax.scene import Scene
+    from physjax.scenes.failures import Failure
     from physjax.study.stability import Limit
 
 
@@ -52,12 +52,13 @@ def _run_stability(name: str, out: str, steps: int) -> None:
         )
     _write_map(scene, limits, folder / f"{name}.png")
     if name in FAILURES:
-        reported = stability.explain(scene, problem.method, problem.dt, steps=problem.steps)
-        print(f"{method_name(problem.method)} with dt = {format_seconds(problem.dt)}: {reported}")
+        failure = cast("Failure", problem)
+        reported = stability.explain(scene, failure.method, failure.dt, steps=failure.steps)
+        print(f"{method_name(failure.method)} with dt = {format_seconds(failure.dt)}: {reported}")
     print(f"Measured on {describe_machine()}.")
 
 
-def _print_limits(name: str, scene: "Scene", at: "Particles | RigidBodies", steps: int | None) -> "list[Limit]":
+def _print_limits(name: str, scene: "Scene", at: "Particles", steps: int | None) -> "list[Limit]":
     """Print a table of the limits of every method about a state, measured in runs of `steps` (None: predicted only)."""
     import numpy as np
 

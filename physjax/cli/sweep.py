@@ -49,7 +49,7 @@ def _run_sweep(options: argparse.Namespace) -> None:
     matplotlib.use("Agg")
     with jax.enable_x64(True):
         found = sweep_scene(build, axes, outcome, method=method, steps=options.steps, out=folder / "chunks")
-        words = OBSERVABLES[outcome].__doc__.strip().rstrip(".")
+        words = (OBSERVABLES[outcome].__doc__ or "").strip().rstrip(".")
         if found.ok.any():
             for name, largest in (("least", False), ("most", True)):
                 best = found.best(outcome, largest=largest)

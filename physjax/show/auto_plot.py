@@ -45,13 +45,13 @@ def plot_run(film: Trajectory, looks: Look | None = None) -> "Figure":
 def animate_run(film: Trajectory, looks: Look | None = None) -> Film:
     """A run as a short film; see `plot_run`."""
     duration = float(np.ptp(np.asarray(film.time)))
-    pace = {"fps": FPS, "speed": duration / float(np.clip(duration, MIN_PLAY_SECONDS, MAX_PLAY_SECONDS))}
+    speed = duration / float(np.clip(duration, MIN_PLAY_SECONDS, MAX_PLAY_SECONDS))
     if _has_emitter(film):
-        return animate.particles(film, **pace)
+        return animate.particles(film, fps=FPS, speed=speed)
     kind, looks = _choose_drawable(film, looks)
     if kind is Dots:
-        return animate.paths(film, every=_lane_stride(film), trail=TRAIL_SECONDS, **pace)
-    return _DRAWERS[kind][1](film, looks, **pace)
+        return animate.paths(film, every=_lane_stride(film), trail=TRAIL_SECONDS, fps=FPS, speed=speed)
+    return _DRAWERS[kind][1](film, looks, fps=FPS, speed=speed)
 
 
 def _has_emitter(film: Trajectory) -> bool:

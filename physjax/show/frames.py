@@ -69,7 +69,7 @@ def take_frames(
             f"{who}: got a film of {position.shape[1]} nodes and a sheet of {nodes}, expected the same number. "
             "Give the lattice the film's scene was made from."
         )
-    whole = np.isfinite(position).all(axis=(-2, -1))
+    whole = np.asarray(np.isfinite(position).all(axis=(-2, -1)))
     return _build_frames(who, film, time, position, whole, dims)
 
 
@@ -77,9 +77,11 @@ def take_lanes(who: str, film: Trajectory, dims: tuple[int, ...] = (1, 2, 3)) ->
     """The frames of a run with all its lanes side by side, `(frames, lanes, dim)`."""
     time, position = _read_frames(who, film)
     position = position.reshape(len(position), -1, position.shape[-1])
-    some = np.isfinite(position).all(axis=-1)
+    some = np.asarray(np.isfinite(position).all(axis=-1))
     coupled = film.scene is not None and film.scene.couples and np.ndim(film.ok) == 0
-    return _build_frames(who, film, time, position, some.all(axis=-1) if coupled else some.any(axis=-1), dims)
+    return _build_frames(
+        who, film, time, position, np.asarray(some.all(axis=-1) if coupled else some.any(axis=-1)), dims
+    )
 
 
 def find_batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | None) -> tuple[int, ...]:
@@ -121,7 +123,7 @@ def pick_frames(who: str, run: Frames, frames: int | Iterable[int] | None, defau
     return [int(frame) % count for frame in asked]
 
 
-def get_springs(who: str, given: Lattice | Springs) -> Springs:
+def get_springs(who: str, given: object) -> Springs:
     """The springs of a lattice, or those given themselves; a TypeError for anything else."""
     springs = given.springs if isinstance(given, Lattice) else given
     if not isinstance(springs, Springs):

@@ -6,11 +6,12 @@ surface nets (Gibson, "Constrained elastic surface nets", 1998): one vertex in e
 quadrilateral around each edge of the grid that it cuts. Details smaller than a cell are lost.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import ENTRY_AXIS_COUNT
@@ -28,11 +29,11 @@ MOTION_SAMPLES = 16
 """Moments at which a surface is compared with itself to see whether it moves."""
 
 
-def evaluate_distance(contact: Contact, t: float | np.floating, points: np.ndarray) -> np.ndarray:
+def evaluate_distance(contact: Contact, t: float, points: np.ndarray) -> np.ndarray:
     """Signed distance [m] of points `(..., dim)` at a time; infinite where it is not a number."""
     contact, flat = _as_float64(contact), np.asarray(points, float).reshape(-1, points.shape[-1])
     with jax.enable_x64(True):
-        distance = np.array(_distance(contact, np.asarray(t, float), flat))
+        distance = np.array(_distance(contact, jnp.asarray(t, float), jnp.asarray(flat)))
     distance[~np.isfinite(distance)] = np.inf
     return distance.reshape(points.shape[:-1])
 
@@ -46,7 +47,8 @@ def project_onto_surface(contact: Contact, t: float, points: np.ndarray, longest
     points = np.concatenate([points, np.repeat(points[:1], (1 << (number - 1).bit_length()) - number, axis=0)])
     for _ in range(PROJECTION_STEPS):
         with jax.enable_x64(True):
-            distance, slope = (np.asarray(x) for x in _distance_and_gradient(contact, np.asarray(t, float), points))
+            found = _distance_and_gradient(contact, jnp.asarray(t, float), jnp.asarray(points))
+        distance, slope = map(np.asarray, found)
         steepness = (slope * slope).sum(axis=-1)
         # the centre of a ball, or an edge of a box, has no gradient: such a point stays where it is
         usable = np.isfinite(distance) & np.isfinite(steepness) & (steepness > 0)
@@ -77,15 +79,15 @@ def _has_number_per_lane(contact: Contact, dim: int) -> bool:
     return any(axes > len(quantity.axes(dim)) + ENTRY_AXIS_COUNT[quantity.per] for axes, quantity in declared)
 
 
-def moves(contact: Contact, stage: Stage, times: np.ndarray) -> bool:
+def moves(contact: Contact, stage: Stage, times: Sequence[float] | np.ndarray) -> bool:
     """Whether any of the points of a coarse grid changes its distance between the given times [s]."""
     grid = _build_grid(stage.low, stage.high, np.full(len(stage.low), 8))
     # the first three moments follow each other closely, or a motion as periodic as the sampling would look like rest
     chosen = np.unique(
         [*range(min(3, len(times))), *np.linspace(0, len(times) - 1, MOTION_SAMPLES).round().astype(int)]
     )
-    first = evaluate_distance(contact, times[0], grid)
-    return any(not np.array_equal(first, evaluate_distance(contact, times[i], grid)) for i in chosen[1:])
+    first = evaluate_distance(contact, float(times[0]), grid)
+    return any(not np.array_equal(first, evaluate_distance(contact, float(times[i]), grid)) for i in chosen[1:])
 
 
 def is_bounded(contact: Contact, stage: Stage, t: float) -> bool:
@@ -119,8 +121,8 @@ def extract_level_set(contact: Contact, stage: Stage, t: float, cells: int) -> t
     grid = _build_grid(stage.low - width, stage.low + (count - 1) * width, count)
     distance = np.minimum(evaluate_distance(contact, t, grid), stage.size * cells)  # infinite numbers have no shares
     points, around = _find_cut_edges(grid, distance)
-    inside = ((around >= 0) & (around < count)).all(axis=-1)
-    number = np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(count), mode="clip")
+    inside = np.asarray(((around >= 0) & (around < count)).all(axis=-1))
+    number = np.asarray(np.ravel_multi_index(tuple(np.moveaxis(around, -1, 0)), tuple(count), mode="clip"))
     used, index = np.unique(number[inside], return_inverse=True)
     total = np.zeros((len(used), 3))
     np.add.at(total, index, np.repeat(points, inside.sum(axis=1), axis=0))
@@ -200,13 +202,13 @@ def _as_float64(contact: Contact) -> Contact:
 
 
 @eqx.filter_jit
-def _distance(contact: Contact, t: ArrayLike, points: ArrayLike) -> Float[Array, " n"]:
+def _distance(contact: Contact, t: Float[Array, ""], points: Float[Array, "n dim"]) -> Float[Array, " n"]:
     return contact.signed_distance(t, points)
 
 
 @eqx.filter_jit
 def _distance_and_gradient(
-    contact: Contact, t: ArrayLike, points: ArrayLike
+    contact: Contact, t: Float[Array, ""], points: Float[Array, "n dim"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n dim"]]:
     # points are independent, so the gradient of the sum holds the gradient of each
     slope = jax.grad(lambda x: jnp.sum(contact.signed_distance(t, x)))(points)

@@ -27,7 +27,8 @@ def project_to_pixels(ax: "Axes", position: np.ndarray) -> np.ndarray:
     if position.shape[-1] == 3:
         from mpl_toolkits.mplot3d import proj3d
 
-        position = np.stack(proj3d.proj_transform(*position.T, cast("Axes3D", ax).get_proj())[:2], axis=-1)
+        x, y, z = position.T
+        position = np.stack(proj3d.proj_transform(x, y, z, cast("Axes3D", ax).get_proj())[:2], axis=-1)
     return ax.transData.transform(position) - (ax.bbox.x0, ax.bbox.y0)
 
 

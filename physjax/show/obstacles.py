@@ -7,7 +7,7 @@ from lane to lane are left out.
 import math
 from collections.abc import Sequence
 from itertools import product
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -139,7 +139,7 @@ def orient_up(vector: np.ndarray, up: int) -> np.ndarray:
 
 def shade_solid(solid: Solid, up: int = 1) -> np.ndarray:
     """Colours of the patches of a solid, lighter towards the lamp."""
-    return _shade(solid.outline.normals, STONE, up)
+    return _shade(cast("np.ndarray", solid.outline.normals), STONE, up)
 
 
 def _shade(normals: np.ndarray, color: str, up: int) -> np.ndarray:

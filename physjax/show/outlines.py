@@ -46,10 +46,13 @@ class Outline(NamedTuple):
 
 
 class ClosedForm(NamedTuple):
-    """A shape whose picture is known without asking its signed distance: points that belong into it, and its outline."""
+    """A shape whose picture is known without asking its signed distance: points that belong into it, and its outline.
 
-    corners: Callable[[Contact, Stage, float], list[np.ndarray]]
-    outline: Callable[[Contact, Stage, float], Outline]
+    Both are functions of the contact, the stage and the time [s].
+    """
+
+    corners: Callable[..., list[np.ndarray]]
+    outline: Callable[..., Outline]
 
 
 def find_corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarray]:

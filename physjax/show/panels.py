@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
     from mpl_toolkits.mplot3d import Axes3D
 
 FIGURE_WIDTH_INCHES = 7.2
@@ -174,7 +175,7 @@ def _fit_boxes(figure: "Figure", drawn: "list[Axes3D]", grid: tuple[int, int], m
         x, y = (width - needed) / 2 - left + column * step, total - above - row * height - top
         ax.set_position((x / width, y / total, side / width, side / total))
         ax.title.set_position((0.5 * (box[0] + box[2]) / side, (top + 0.02) / side))
-        ax._autotitlepos = False  # or matplotlib would move the title back when it draws
+        ax._autotitlepos = False  # pyright: ignore[reportAttributeAccessIssue] private; or matplotlib would move the title back when it draws
 
 
 def _clear_labels(ax: "Axes3D") -> None:
@@ -187,7 +188,10 @@ def _clear_labels(ax: "Axes3D") -> None:
 def _measure_labelled_box(figure: "Figure", ax: "Axes3D", box: list[float]) -> np.ndarray:
     """Left, lower, right and upper end of a box with its labels [inches]."""
     renderer = cast("FigureCanvasAgg", figure.canvas).get_renderer()
-    labels = [axis.get_tightbbox(renderer).extents / figure.dpi for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
+    labels = [
+        np.array(cast("Bbox", axis.get_tightbbox(renderer)).extents) / figure.dpi
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis)
+    ]
     ends = np.array([box, *labels])
     return np.concatenate([ends[:, :2].min(axis=0), ends[:, 2:].max(axis=0)])
 
@@ -197,6 +201,7 @@ def _measure_box(ax: "Axes3D") -> tuple[float, float, float, float]:
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
     corners = np.array(list(product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim())))
-    x, y, _ = proj_transform(*corners.T, ax.get_proj())
+    x, y, z = corners.T
+    x, y, _ = proj_transform(x, y, z, ax.get_proj())
     points = ax.transAxes.inverted().transform(ax.transData.transform(np.stack([x, y], axis=-1)))
     return *points.min(axis=0), *points.max(axis=0)

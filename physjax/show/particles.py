@@ -1,7 +1,7 @@
 """Particles of an emitter: dots with the size, colour and opacity of their age, light that adds up, or their density."""
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
+
+    from physjax.physics.emitters.emitter import Emitter
 
 SMALLEST_DOT_POINTS = 1.5
 """Diameter of the smallest dot [points]."""
@@ -91,7 +93,7 @@ def prepare_particles(
     seen = take_lanes(who, film, dims=(2, 3))
     if film.scene is None or film.scene.emitter is None:
         raise ValueError(f"{who}: got a run without an emitter, expected Scene(..., emitter=...).")
-    emitter = film.film.emitter
+    emitter = cast("Emitter", film.film.emitter)
     # births are random numbers of the floating-point type of the run: another type would give other particles
     with jax.enable_x64(film.time.dtype == np.float64):
         alive, look = emitter.alive(film.time), emitter.appearance(film.time)
@@ -104,7 +106,7 @@ def prepare_particles(
             lambda figure, where: draw_colour_bar(figure, where, density_map.colours(), label, extend="max"),
         )
     colour = np.concatenate([look.colour, np.asarray(look.opacity)[..., None]], axis=-1)
-    glows = film.scene.emitter.look.glows
+    glows = emitter.look.glows
     return seen, ParticleDots(np.asarray(look.alive), np.asarray(look.size), np.clip(colour, 0.0, 1.0), glows), None
 
 

@@ -53,7 +53,7 @@ class Stage(NamedTuple):
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which points `(..., dim)` are inside, or nearly."""
         slack = EDGE_SLACK_SHARE * self.size
-        return ((points >= self.low - slack) & (points <= self.high + slack)).all(axis=-1)
+        return np.asarray(((points >= self.low - slack) & (points <= self.high + slack)).all(axis=-1))
 
 
 def build_stage(run: Frames, frames: Sequence[int]) -> Stage:
@@ -102,7 +102,7 @@ def _style_space_axes(ax: "Axes3D", stage: Stage, up: int) -> None:
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.labelpad = 2
         axis.label.set_fontsize(8.5)
-    ax.set_box_aspect(stage.high - stage.low, zoom=1.0)
+    ax.set_box_aspect(stage.high - stage.low, zoom=1)
 
 
 def get_space_axes(ax: "Axes3D") -> "list[SpaceAxis]":

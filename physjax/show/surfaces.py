@@ -72,7 +72,7 @@ def draw_surface(
         layers[find_back_faces(triangles, ax)] = 1
     groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
     groups += [(solid.outline.polygons, obstacles.shade_solid(solid, scenery.up), 3) for solid in solids]
-    drawn = [
+    drawn: list[Artist] = [
         Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
         for polygons, shades, order in groups
         if len(polygons)
@@ -86,7 +86,8 @@ def find_back_faces(triangles: np.ndarray, ax: "Axes3D") -> np.ndarray:
     """Which triangles `(n, 3, 3)` are seen from behind: their corners go round clockwise as the axes show them."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-    x, y, _ = proj_transform(*triangles.reshape(-1, 3).T, ax.get_proj())
+    x, y, z = triangles.reshape(-1, 3).T
+    x, y, _ = proj_transform(x, y, z, ax.get_proj())
     (xa, xb, xc), (ya, yb, yc) = (np.reshape(part, (-1, 3)).T for part in (x, y))
     return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
 

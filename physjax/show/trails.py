@@ -31,7 +31,7 @@ class Trails(NamedTuple):
         from matplotlib.collections import LineCollection
 
         position = scenery.position(frame)
-        alive: np.ndarray = np.isfinite(position).all(axis=-1)
+        alive = np.asarray(np.isfinite(position).all(axis=-1))
         # the area of a dot [points²]: about the same ink, however many there are
         dots = dict(c=self.colours[alive], s=float(np.clip(4000 / len(alive), 5, 45)), linewidths=0, zorder=4)
         pieces, colours = self._build_pieces(scenery.run, frame)
@@ -64,7 +64,9 @@ def build_trails(who: str, run: Frames, every: int, color: ArrayLike | None, tra
     lanes = run.position.shape[1]
     shade = np.arange(lanes, dtype=float) if color is None else np.asarray(color, float).ravel()
     if len(shade) != lanes or not np.isfinite(shade).all():
-        raise ValueError(f"{who}: got color {np.shape(color)}, expected a finite number for each of the {lanes} lanes.")
+        raise ValueError(
+            f"{who}: got color {np.asarray(color).shape}, expected a finite number for each of the {lanes} lanes."
+        )
     shade = shade[::every]
     colours = colormaps["viridis"]((shade - shade.min()) / (np.ptp(shade) or 1.0) * 0.9)
     return run._replace(position=run.position[:, ::every]), Trails(colours, trail)

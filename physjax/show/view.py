@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -89,8 +89,8 @@ def view(
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
     lines coloured by strain, a `solids` shape or one for each body. Without it bodies are boxes of their inertia, nodes
-    are joined by the scene's springs, and everything else is dots with their paths. `color` is one
-    for surfaces and bodies, a value for each lane for dots. The page plays `speed` seconds of the run a second, in `fps`
+    are joined by the scene's springs, and everything else is dots with their paths. `color` is one for surfaces and
+    bodies, a value for each lane for dots. The page plays `speed` seconds of the run a second, in `fps`
     frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
     Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; 2-D films are for
@@ -105,16 +105,14 @@ def view(
     whole = seen.surface() if isinstance(seen, Bodies) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
     scenery = build_scenery(whole.run, frames)
-    index = find_batch_index(who, film, scene) if isinstance(seen, Lines) else ()
     if isinstance(seen, Surface):
         part = _describe_surface(seen, scenery, frames, color)
     elif isinstance(seen, Bodies):
         part = _describe_bodies(seen, scenery, frames, color)
     elif isinstance(seen, Lines):
-        part = _describe_lines(who, film, seen, index, scenery, frames)
+        part = _describe_lines(who, film, seen, find_batch_index(who, film, scene), scenery, frames)
     else:
         part = _describe_dots(who, seen, scenery, frames, color)
-    low, high = scenery.stage
     return View(
         {
             "frames": frames,
@@ -122,8 +120,8 @@ def view(
             "time": scenery.run.time[frames].tolist(),
             "fps": fps,
             "speed": float(speed),
-            "low": low.tolist(),
-            "high": high.tolist(),
+            "low": scenery.stage.low.tolist(),
+            "high": scenery.stage.high.tolist(),
             "reach": [end.tolist() for end in build_padded_box(scenery)],
             "from": [ELEVATION, AZIMUTH],
             "up": scenery.up,
@@ -134,7 +132,9 @@ def view(
     )
 
 
-def _describe_surface(seen: Surface, scenery: Scenery, frames: list[int], color: "ColorType | None") -> Json:
+def _describe_surface(
+    seen: Surface, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None"
+) -> Json:
     return {
         "kind": "surface",
         "color": _to_hex(color),
@@ -144,7 +144,7 @@ def _describe_surface(seen: Surface, scenery: Scenery, frames: list[int], color:
     }
 
 
-def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: "ColorType | None") -> Json:
+def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None") -> Json:
     """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape."""
     turn = np.roll(seen.orientation[frames], -1, axis=-1)
     return {
@@ -178,9 +178,11 @@ def _describe_lines(
     }
 
 
-def _describe_dots(who: str, seen: Dots, scenery: Scenery, frames: list[int], color: ArrayLike | None) -> Json:
+def _describe_dots(
+    who: str, seen: Dots, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None"
+) -> Json:
     """Lanes in colours of their own, with their whole paths if there are few of them."""
-    _, trails = build_trails(who, seen.run, 1, color, 0.0)
+    _, trails = build_trails(who, seen.run, 1, cast("ArrayLike | None", color), 0.0)
     return {
         "kind": "dots",
         "nodes": seen.run.position.shape[1],
@@ -190,10 +192,10 @@ def _describe_dots(who: str, seen: Dots, scenery: Scenery, frames: list[int], co
     }
 
 
-def _to_hex(color: "ColorType | None") -> str:
+def _to_hex(color: "ColorType | ArrayLike | None") -> str:
     from matplotlib.colors import to_hex
 
-    return to_hex("#56B4E9" if color is None else color)
+    return to_hex("#56B4E9" if color is None else cast("ColorType", color))
 
 
 @cache
