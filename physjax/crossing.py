@@ -7,19 +7,19 @@ moment within the step is a root along the method's own path; it moves with ever
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import any_lane
 from physjax.checks import quantity
 from physjax.closures import warn_of_recompilation
-from physjax.loops import Moment, moment_at, repeat_steps, to_float_time
+from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
 from physjax.particles import append_axes, demand_particles
 from physjax.parts import as_module
 from physjax.roots import find_first_root
@@ -44,34 +44,43 @@ class Height(eqx.Module):
     height: Float[Array, "..."] = quantity("height", "m")
     up: int = eqx.field(static=True, default=1)
 
-    def signed_distance(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+    def signed_distance(self, t: Time, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """How far above [m]."""
         return position[..., self.up] - self.height.astype(position.dtype)
 
 
+@runtime_checkable
+class Distanced(Protocol):
+    """A surface that knows the signed distance to it: a contact shape, a height, or one of the user's own."""
+
+    def signed_distance(self, t: Time, position: Array) -> Array:
+        """Signed distance of each lane [m]."""
+        ...
+
+
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
-def find_first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
+def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
     demand_particles("crossing", run.scene.state, "of bodies record the gap instead")
     if direction not in (None, 1, -1):
         raise ValueError(
             f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
         )
-    if not hasattr(surface, "signed_distance"):
+    if not isinstance(surface, Distanced):
         warn_of_recompilation("crossing", [surface])
-        surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
+        surface = as_module(surface) if callable(surface) else Height(jnp.asarray(surface), run.scene.up)
     return _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
 @eqx.filter_jit
-def _find_crossings(run: Any, surface: Any, way: Array) -> Crossing:
+def _find_crossings(run: PyTree, surface: PyTree, way: Array) -> Crossing:
     find = lambda run: _find_run_crossings(run, surface, way)  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
         find = jax.vmap(find)
     return find(run)
 
 
-def _find_run_crossings(run: Any, surface: Any, way: Array) -> Crossing:
+def _find_run_crossings(run: PyTree, surface: PyTree, way: Array) -> Crossing:
     scene, signed_distance = run.scene, _get_distance_function(surface, run.scene)
     if not (scene.couples and scene.state.lanes):  # one ball is tied to nobody, whatever its forces say
         return _find_unit_crossings(run, signed_distance, way, lambda leaf: leaf)
@@ -103,7 +112,7 @@ class _Replay(NamedTuple):
     Every number has the shape of what is stepped on its own: a lane, or a scene of coupled ones.
     """
 
-    frames: Any
+    frames: PyTree
     step: Callable
     signed_distance: Callable
     first_step: Array
@@ -128,18 +137,18 @@ class _Replay(NamedTuple):
         """When the step begins that comes i steps after a frame."""
         return moment_at(self.first_step + frame * self.steps_per_frame + i, self.dt, self.dt.dtype)
 
-    def take_frame(self, frame: Array) -> Any:
+    def take_frame(self, frame: Array) -> PyTree:
         """What changes, as it was at a frame of its own for each lane."""
         return jax.tree.map(lambda leaf: _take_frames(leaf, frame), self.frames)
 
-    def measure_distance(self, t: Array, moving: Any) -> Array:
+    def measure_distance(self, t: Array, moving: PyTree) -> Array:
         """The gap; zero where it is less than rounding, or what starts on the surface would cross it at once."""
         value, x = self.signed_distance(t, moving.state.position), moving.state.position
         size = jnp.broadcast_to(norm(x), value.shape) if x.ndim == value.ndim + 1 else jnp.max(norm(x), axis=-1)
         return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(x.dtype).eps) * size, 0.0, value)
 
 
-def _find_unit_crossings(run: Any, signed_distance: Callable, way: Array, own: Callable) -> Crossing:
+def _find_unit_crossings(run: PyTree, signed_distance: Callable, way: Array, own: Callable) -> Crossing:
     """The first crossing of every lane, or, where they are coupled, of one node in every scene, which `own` picks."""
     replay = _build_replay(run, signed_distance)
     place = _find_crossing_step(replay.stop_gradients(), way)
@@ -163,13 +172,13 @@ def _find_unit_crossings(run: Any, signed_distance: Callable, way: Array, own: C
     tolerance = 4 * float(jnp.finfo(replay.dt.dtype).eps) * replay.dt
     values = (side * place.before, side * place.after)
     search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
-    duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
+    duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))  # pyright: ignore[reportCallIssue]  # a custom derivative hides its signature
     x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
     reported = lambda leaf: jnp.where(append_axes(place.found, leaf), leaf, jnp.nan)  # noqa: E731
     return Crossing(reported(to_float_time(begun + duration)), reported(x), reported(v), place.found)
 
 
-def _build_replay(run: Any, signed_distance: Callable) -> _Replay:
+def _build_replay(run: PyTree, signed_distance: Callable) -> _Replay:
     """The run made ready to be stepped again."""
     scene, film, shape = run.scene, run.film, run.scene.status_shape
     changes = jax.tree.map(lambda a, b: a.ndim < b.ndim, scene, film)
@@ -257,13 +266,13 @@ def _crosses(before: Array, after: Array, way: Array) -> Array:
     return (falls & (way <= 0)) | (rises & (way >= 0))
 
 
-def _stop_closure_gradients(function: Callable, *examples: Any) -> Callable:
+def _stop_closure_gradients(function: Callable, *examples: PyTree) -> Callable:
     """The function without derivatives by what it closes over."""
     numbers, pure = _hoist_closure(function, *examples)
     return partial(pure, lax.stop_gradient(numbers))
 
 
-def _hoist_closure(function: Callable, *examples: Any) -> tuple[Any, Callable]:
+def _hoist_closure(function: Callable, *examples: PyTree) -> tuple[PyTree, Callable]:
     """Every array that a function closes over, and the function with these as its first argument."""
     numbers, rest = eqx.partition(
         eqx.filter_closure_convert(lambda *arguments: function(*arguments), *examples), eqx.is_array
@@ -279,20 +288,20 @@ def _take_frames(leaf: Array, frame: Array) -> Array:
     return jnp.take_along_axis(leaf, index, axis=0)[0]
 
 
-def _get_distance_function(surface: Any, scene: Any) -> Callable:
+def _get_distance_function(surface: PyTree, scene: PyTree) -> Callable:
     """The surface's gap, if it gives a number for each lane."""
-    signed_distance = getattr(surface, "signed_distance", surface)
+    signed_distance = surface.signed_distance if isinstance(surface, Distanced) else surface
     t = jnp.zeros(scene.status_shape, scene.state.dtype)
     seen = jax.eval_shape(signed_distance, t, scene.state.position)
     if seen.shape != scene.state.lanes:
         raise ValueError(
-            f"crossing: the surface's gap(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
+            f"crossing: the surface's signed_distance(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
             "one distance [m] for each, e.g. position[..., 1] - 2.0."
         )
     return signed_distance
 
 
-def _demand_unshared_memory(changing: Any, shape: tuple[int, ...]) -> None:
+def _demand_unshared_memory(changing: PyTree, shape: tuple[int, ...]) -> None:
     """Raise a ValueError if lanes share something that changes: they are stepped from different frames."""
     if any(leaf.shape[: len(shape)] != shape for leaf in jax.tree.leaves(changing)):
         raise ValueError(

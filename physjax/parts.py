@@ -1,16 +1,20 @@
 """The parts of a scene: what a force and a contact are, and what becomes of them when a scene is built."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from typing import ClassVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import demand_start_outside
+from physjax.loops import Time
+from physjax.old_names import serve_old_names
 from physjax.particles import Particles, demand_particles
 from physjax.vectors import scale
 
@@ -21,31 +25,44 @@ class Function(eqx.Module):
     function: Callable = eqx.field(static=True)
     couples: bool = eqx.field(static=True, default=True)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: PyTree) -> PyTree:
         """Call the function."""
         return self.function(*arguments)
 
 
-def as_module(function: Callable) -> eqx.Module:
+def as_module(function: Callable) -> PyTree:
     """A plain function wrapped so that it can travel in a pytree; modules are returned as they are."""
     return function if isinstance(function, eqx.Module) else Function(function)
 
 
-def find_plain_functions(part: Any) -> list[Function]:
+def find_plain_functions(part: PyTree) -> list[Function]:
     """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
     is_plain = lambda node: isinstance(node, Function)  # noqa: E731
     return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
 
 
+FORCE_OLD_NAMES = {
+    "during": "averaged_over_step",
+    "near": "linearised_at",
+    "definite": "dissipative_symmetric",
+}
+CONTACT_OLD_NAMES = {
+    "gap": "signed_distance",
+    "answered": "resolve",
+    "forgetting": "forget_lanes",
+    "prepared": "prepare",
+}
+"""What abilities were called in the first edition."""
+
+
 class Force(eqx.Module):
     """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
 
-    `couples` says whether a lane's force depends on other lanes. `t` [s] is a scalar or per lane. A conservative force
-    also gives its `potential(t, state, mass)` [J], shaped like the lanes (a shared energy is halved between its two
-    lanes). A force that remembers has `advance(t, dt, state) -> (force, state)`, called once after every accepted step.
-    One that jumps in time has `averaged_over_step(t, dt, state) -> force`, its mean over a step, and lists its `discontinuities()`.
-    `near(t, state, mass) -> force` is its tangent for implicit steps; one that is `dissipative_symmetric` always pushes back.
-    Its numbers are fields made with `quantity`; one that depends on g or on which axis is up asks the scene: `under`.
+    `t` [s] is a scalar or one per lane. `couples` says whether a lane's force depends on other lanes. Numbers are fields
+    made with `quantity`. Everything below `__call__` is an ability that a force may have, with the default of one that
+    has it not: a conservative force gives its `potential`, one that jumps in time its mean (`averaged_over_step`) and its
+    `discontinuities`, one with memory how it `advance`s, one that depends on g or on which axis is up asks the scene
+    (`under`).
 
     Example:
         >>> class Engine(Force):
@@ -56,19 +73,78 @@ class Force(eqx.Module):
     """
 
     couples: ClassVar[bool] = False
+    is_field: ClassVar[bool] = False
+    """Whether it is proportional to mass and gives an `acceleration`, as a `Field` does."""
+    dissipative_symmetric: ClassVar[bool] = False
+    """Whether its Jacobian is symmetric and takes energy, as that of springs: implicit steps then use conjugate gradients."""
+    sees_moments: ClassVar[bool] = False
+    """Whether it takes the time as a `Moment`, which keeps what one float32 cannot hold."""
+
+    def __init_subclass__(cls, **options: object):
+        super().__init_subclass__(**options)
+        serve_old_names(cls, FORCE_OLD_NAMES)
 
     @abstractmethod
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """Force on each lane [N]."""
 
+    def potential(self, t: ArrayLike, state: PyTree, mass: PyTree) -> Array | None:
+        """Potential energy [J], shaped like the lanes (a shared energy is halved between its two lanes); None without one."""
+        return None
+
     @property
-    def weight(self) -> tuple[Any, int] | None:
+    def has_potential(self) -> bool:
+        """Whether the force is conservative, with its `potential`."""
+        return type(self).potential is not Force.potential
+
+    def averaged_over_step(self, t: Time, dt: ArrayLike, state: PyTree) -> "Force":
+        """The force as a step from t to t + dt [s] sees it: one that jumps in time gives its mean."""
+        return self
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the force jumps in time, and a step must see its mean (`averaged_over_step`)."""
+        return type(self).averaged_over_step is not Force.averaged_over_step
+
+    def discontinuities(self) -> tuple[Array, ...]:
+        """Times [s] at which the force jumps."""
+        return ()
+
+    def linearised_at(self, t: Time, state: PyTree, mass: PyTree) -> "Force":
+        """The force that an implicit step differentiates at this state in place of this one."""
+        return self
+
+    @property
+    def has_linearisation(self) -> bool:
+        """Whether an implicit step differentiates another force than this one (`linearised_at`)."""
+        return type(self).linearised_at is not Force.linearised_at
+
+    def advance(self, t: ArrayLike, dt: ArrayLike, state: PyTree) -> tuple["Force", PyTree]:
+        """The force and the state after a step from t to t + dt [s] was taken, for one with memory: springs that break."""
+        return self, state
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the force has memory, which `advance` changes after every step."""
+        return type(self).advance is not Force.advance
+
+    @property
+    def up_axis(self) -> int | None:
+        """The axis that points up, of a force that has one in a field `up`."""
+        axis = getattr(self, "up", None)
+        return axis if isinstance(axis, int) else None
+
+    @property
+    def weight(self) -> tuple[ArrayLike | None, int] | None:
         """g [m/s²] (None: not along an axis) and the axis that is up, of a force that is the weight; None of any other."""
         return None
 
-    def under(self, weight: tuple[Any, int]) -> "Force":
+    def under(self, weight: tuple[ArrayLike | None, int]) -> "Force":
         """The force in a scene with this weight: one that needs g and up takes them over, or refuses what it cannot."""
         return self
+
+
+serve_old_names(Force, FORCE_OLD_NAMES)
 
 
 class Field(Force):
@@ -81,6 +157,8 @@ class Field(Force):
         >>> print(Tide()(0.0, ball, shot.mass))
         [ 0. 10.]
     """
+
+    is_field: ClassVar[bool] = True
 
     @abstractmethod
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
@@ -107,6 +185,10 @@ class Contact(eqx.Module):
     response: ClassVar[Callable | None] = None
     memory: ClassVar[tuple[str, ...]] = ()
 
+    def __init_subclass__(cls, **options: object):
+        super().__init_subclass__(**options)
+        serve_old_names(cls, CONTACT_OLD_NAMES)
+
     @abstractmethod
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Signed distance to the surface [m], > 0 on the legal side."""
@@ -123,34 +205,91 @@ class Contact(eqx.Module):
         """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
         return self
 
-    def resolve(self, t: ArrayLike, state: Any, mass: Any) -> Any:
+    def resolve(self, t: ArrayLike, state: PyTree, mass: PyTree) -> PyTree:
         """What `project` takes: `respond`, unless an answer needs the masses."""
         return self.respond(t, state)
 
-    def clearance(self, t: ArrayLike, state: Any) -> Float[Array, "*lanes"]:
+    def clearance(self, t: ArrayLike, state: PyTree) -> Float[Array, "*lanes"]:
         """How far each lane is from touching [m]."""
         return self.signed_distance(t, state.position)
 
-    def demand_fit(self, state: Any, mass: Any) -> None:
+    def demand_fit(self, state: PyTree, mass: PyTree) -> None:
         """Raise a TypeError for what cannot touch it, and a ValueError for lanes that start on the wrong side."""
         demand_particles("contacts", state, "rigid bodies touch with rigid.Touch(hull, plane)")
         demand_start_outside(self, state)
 
-    def prepare(self, state: Any, couples: bool) -> "Contact":
+    def prepare(self, state: PyTree, couples: bool) -> "Contact":
         """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
         return self
 
 
-def build_memory_mask(part: Any) -> Any:
-    """A part of a scene with True in place of each array that its `memory` names, False elsewhere."""
+def build_memory_mask(part: PyTree) -> PyTree:
+    """A contact or an emitter with True in place of each array that its `memory` names, False elsewhere."""
     mask = jax.tree.map(lambda _: False, part)
-    where = lambda part: [getattr(part, name) for name in part.memory]  # noqa: E731
-    return eqx.tree_at(where, mask, [True] * len(part.memory)) if getattr(part, "memory", ()) else mask
+    if part is None or not part.memory:
+        return mask
+    return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
+
+
+serve_old_names(Contact, CONTACT_OLD_NAMES)
+
+
+class ParticleSource(eqx.Module):
+    """What lets the lanes of a scene be born and die within a step; `memory` names the arrays that this changes."""
+
+    memory: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def prepare(self, scene: PyTree) -> "ParticleSource":
+        """The source as part of this scene; the checks are here."""
+
+    @abstractmethod
+    def live(self, motion: Callable, scene: PyTree, t: Time, dt: ArrayLike) -> PyTree:
+        """The scene after a step, in which each lane moves from its birth, or the start, to its death, or the end."""
+
+
+def has_memory(part: PyTree) -> bool:
+    """Whether a step changes arrays of this part of a scene, as well as the state."""
+    return part is not None and (part.remembers if isinstance(part, Force) else bool(part.memory))
+
+
+def build_advance_mask(force: Force, state: PyTree, mass: PyTree) -> PyTree:
+    """A force with True in place of each array that its `advance` replaces: found by tracing it and comparing identities."""
+    if not force.remembers:
+        return jax.tree.map(lambda _: False, force)
+    masks = []
+
+    def trace(force, state):
+        zero = jnp.zeros((), state.dtype)
+        after, _ = force.advance(zero, zero, state)
+        masks.append(jax.tree.map(lambda before, now: before is not now, force, adopt_force(after)))
+
+    jax.eval_shape(trace, force, state)
+    return masks[0]
+
+
+@cache
+def _adopt_class(cls: type) -> type:
+    """The class of a user's force that is not derived from `Force`, with the defaults of `Force` for what it lacks."""
+    own = {} if hasattr(cls, "couples") else {"couples": True}  # what does not say may look at any lane
+    names = {"__module__": cls.__module__, "__qualname__": cls.__qualname__, "__doc__": cls.__doc__}
+    # with its own way to begin: a dataclass would make one in which a default of `Force` may stand before a field without one
+    return type(cls)(cls.__name__, (cls, Force), own | names | {"__init__": cls.__init__})
+
+
+def adopt_force(part: Callable) -> Force:
+    """Any callable as a `Force`: a plain function, or a module of the user's own with some of the abilities of one."""
+    module = as_module(part)
+    if isinstance(module, Force):
+        return module
+    adopted = object.__new__(_adopt_class(type(module)))
+    vars(adopted).update(vars(module))
+    return adopted
 
 
 def unify_gravity(forces: list, dim: int) -> tuple:
     """The forces, agreed about g and which axis of `dim` is up: those of `Gravity`, of several the sum."""
-    weights = [force.weight for force in forces if isinstance(force, Force) and force.weight is not None]
+    weights = [force.weight for force in forces if force.weight is not None]
     for _, up in weights:
         if up >= dim:
             raise ValueError(
@@ -162,40 +301,40 @@ def unify_gravity(forces: list, dim: int) -> tuple:
         raise ValueError(f"forces: got Gravity along the axes {sorted(axes)}, expected one axis that is up for all.")
     known = [g for g, _ in weights if g is not None]
     weight = (sum(known[1:], known[0]) if len(known) == len(weights) else None, weights[0][1])
-    return tuple(force.under(weight) if isinstance(force, Force) else force for force in forces)
+    return tuple(force.under(weight) for force in forces)
 
 
-def as_tuple(kind: str, parts: Any) -> tuple:
+def as_tuple(kind: str, parts: object) -> tuple:
     """The parts as a tuple; a single one given without it is an easy slip and gets an error that says so."""
-    if callable(parts) or not hasattr(parts, "__iter__"):
+    if callable(parts) or not isinstance(parts, Iterable):
         raise TypeError(f"{kind}s: got {type(parts).__name__}, expected a tuple of {kind}s. Write {kind}s=({kind},).")
     return tuple(parts)
 
 
-def prepare_force(force: Any, dtype: np.dtype) -> eqx.Module:
+def prepare_force(force: Callable, dtype: np.dtype) -> Force:
     """A force as a pytree of arrays in the scene's dtype; a TypeError for what is none."""
     expected = "a force: a callable (t, state, mass) -> newtons"
     return _prepare_part("force", force, callable(force) and not isinstance(force, type), expected, dtype)
 
 
-def prepare_contact(contact: Any, dtype: np.dtype) -> eqx.Module:
+def prepare_contact(contact: object, dtype: np.dtype) -> Contact:
     """A contact as a pytree of arrays in the scene's dtype; a TypeError for what is none."""
     expected = "a contact, e.g. contacts.Plane(point=(0, 0), normal=(0, 1))"
     return _prepare_part("contact", contact, isinstance(contact, Contact), expected, dtype)
 
 
-def _prepare_part(kind: str, part: Any, good: bool, expected: str, dtype: np.dtype) -> eqx.Module:
+def _prepare_part(kind: str, part: PyTree, good: bool, expected: str, dtype: np.dtype) -> PyTree:
     """A force or contact as a pytree of arrays whose floating-point numbers have the scene's dtype; a TypeError otherwise."""
     if not good:
         raise TypeError(f"{kind}s: got {type(part).__name__} {part!r}, expected {expected}.")
-    part = part if isinstance(part, eqx.Module) else Function(part)
+    part = adopt_force(part) if kind == "force" else part
     for path, leaf in jax.tree_util.tree_leaves_with_path(part):
         _demand_array(part, path, leaf)
     cast = lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf  # noqa: E731
     return jax.tree.map(cast, part)
 
 
-def _demand_array(part: Any, path: tuple, leaf: Any) -> None:
+def _demand_array(part: object, path: tuple, leaf: object) -> None:
     """Raise a TypeError for a leaf that a compiled program cannot take: only arrays and floats change from run to run."""
     if isinstance(leaf, jax.Array | np.ndarray | np.generic | float):
         return
@@ -212,8 +351,3 @@ def _demand_array(part: Any, path: tuple, leaf: Any) -> None:
         f"{name}: the field {field} holds a {kind}, expected an array or a float. What is no number is a part of the "
         "program: declare it with eqx.field(static=True)."
     )
-
-
-def force_name(force: Any) -> str:
-    """What a force is called in sentences: its class, or the name of the function that it is."""
-    return getattr(getattr(force, "function", force), "__name__", type(force).__name__)

@@ -1,7 +1,6 @@
 """Lanes that no force moves because something else does: a hand that shakes a flag, the limb that drags a body."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import concrete_or_none, unchecked_quantity
 from physjax.particles import Particles, demand_particles
@@ -34,10 +33,10 @@ class Pins(eqx.Module):
         [0. 1. 0.] [0. 2. 0.]
     """
 
-    nodes: Bool[Array, "*lanes"] = unchecked_quantity("prescribed nodes", per="memory")
     path: Callable
+    nodes: Bool[Array, "*lanes"] = unchecked_quantity("prescribed nodes", per="memory")
 
-    def __init__(self, nodes: Any, path: Any):
+    def __init__(self, nodes: ArrayLike, path: Callable):
         nodes = jnp.asarray(nodes)
         if nodes.dtype != bool:
             raise ValueError(f"Pins: got nodes of dtype {nodes.dtype}, expected booleans, one for each lane.")
@@ -59,6 +58,9 @@ class Pins(eqx.Module):
         # kept apart: XLA on CPU would follow the path again for every neighbour that looks at a lane
         return state._replace(**lax.optimization_barrier({"position": position, "velocity": velocity}))
 
+    lead = prescribe
+    """The name of the first edition."""
+
     def prescribe_acceleration(
         self, t: ArrayLike, state: Particles, acceleration: Float[Array, "*lanes dim"]
     ) -> Float[Array, "*lanes dim"]:
@@ -67,7 +69,7 @@ class Pins(eqx.Module):
         _, path_acceleration = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
         return self._replace_prescribed(path_acceleration, acceleration)
 
-    def prepare(self, state: Any) -> "Pins":
+    def prepare(self, state: PyTree) -> "Pins":
         """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
         demand_particles("Pins", state, "bodies are held by a mask, or by a point of theirs, mass=inertia.about(point)")
         if self.nodes.shape != state.lanes:

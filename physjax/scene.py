@@ -6,16 +6,16 @@ earlier axes count scenes. A per-lane number is a scalar or has the shape of the
 unless a force says otherwise.
 """
 
-from collections.abc import Callable
-from functools import wraps
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial, wraps
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import SINGLE_PIECE_NODES, materialise
 from physjax.loops import (
@@ -27,25 +27,26 @@ from physjax.loops import (
     time_for_part,
     to_float_time,
 )
-from physjax.particles import Particles, check_load_shape, sum_terms
+from physjax.particles import Particles, demand_state_record
 from physjax.parts import (
     Contact,
-    Field,
     Force,
-    Function,
+    ParticleSource,
+    adopt_force,
     as_module,
     as_tuple,
+    build_advance_mask,
     build_memory_mask,
     find_plain_functions,
     prepare_contact,
     prepare_force,
     unify_gravity,
 )
+from physjax.pins import Pins
 from physjax.quantities import build_lane_mask, demand_fitting_numbers, mark_invalid_lanes, may_hide_lanes
-from physjax.vectors import scale
 
 
-def project(motion: Callable, scene: "Scene", t: Time, dt: Time) -> "Scene":
+def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
     """The lecture's response: step as if nothing were there, then put back and turn around what went in.
 
     Cheap and robust, first order in dt: a bounce happens at the end of the step, not when the surface was met, and a
@@ -81,32 +82,28 @@ class Scene(eqx.Module):
         [ -3.  -13.8]
     """
 
-    state: Any = eqx.field(metadata=RECORD)
-    mass: Any = eqx.field(metadata=RECORD)
+    state: PyTree = eqx.field(metadata=RECORD)
+    mass: PyTree = eqx.field(metadata=RECORD)
     forces: tuple
     contacts: tuple
-    pinned: Bool[Array, "*lanes"] | eqx.Module | None = eqx.field(metadata=RECORD)
-    emitter: eqx.Module | None
+    pinned: Bool[Array, "*lanes"] | Pins | None = eqx.field(metadata=RECORD)
+    emitter: ParticleSource | None
     reaction: Callable | None = eqx.field(init=False)
 
     @jax.transfer_guard("allow")  # what a scene is given goes to the device on purpose
     def __init__(
         self,
-        state: Any,
-        mass: Any = 1.0,
-        forces: Any = (),
-        contacts: Any = (),
-        pinned: Any = None,
-        emitter: Any = None,
+        state: PyTree,
+        mass: PyTree = 1.0,
+        forces: Sequence[Callable] = (),
+        contacts: Sequence[Contact] = (),
+        pinned: ArrayLike | Pins | None = None,
+        emitter: ParticleSource | None = None,
     ):
-        if not hasattr(state, "validate"):
-            raise TypeError(
-                f"Scene: got a state of type {type(state).__name__}, expected Particles(position, velocity), "
-                "or RigidBodies(position, orientation, momentum, angular_momentum)."
-            )
+        demand_state_record(state)
         state, mass = state.validate(mass)
         lanes, dtype = state.lanes, state.dtype
-        if hasattr(pinned, "prescribe"):
+        if isinstance(pinned, Pins):
             pinned = pinned.prepare(state)
             state = pinned.prescribe(0.0, state)
         elif pinned is not None:
@@ -134,25 +131,25 @@ class Scene(eqx.Module):
 
     @property
     def couples(self) -> bool:
-        """Whether any force or contact ties lanes together; a force that does not say counts as coupling."""
-        return any(getattr(part, "couples", True) for part in (*self.forces, *self.contacts))
+        """Whether any force or contact ties lanes together; a plain function counts as one that does."""
+        return any(part.couples for part in (*self.forces, *self.contacts))
 
     @property
     def up(self) -> int:
         """The axis that points up: that of the weight, else of what else has an `up`, else y, of a line the only one."""
-        named = [part for part in self.forces if isinstance(getattr(part, "up", None), int)]
-        first = sorted(named, key=lambda part: not isinstance(part, Field))
-        return first[0].up if first else min(1, self.state.position.shape[-1] - 1)
+        axes = [force.up_axis for force in sorted(self.forces, key=lambda force: not force.is_field)]
+        known = [axis for axis in axes if axis is not None]
+        return known[0] if known else min(1, self.state.position.shape[-1] - 1)
 
     @property
     def held(self) -> Bool[Array, "*lanes"] | None:
-        """Mask of the lanes that no force moves, held where they are or led along a path; None where there are none."""
-        return self.pinned if self.prescribed_motion is None else self.prescribed_motion.nodes
+        """Mask of the lanes that no force moves, held where they are or moved along a path; None where there are none."""
+        return self.pinned.nodes if isinstance(self.pinned, Pins) else self.pinned
 
     @property
-    def prescribed_motion(self) -> Any:
-        """The `Pins` that lead lanes along a path; None without."""
-        return self.pinned if hasattr(self.pinned, "prescribe") else None
+    def prescribed_motion(self) -> Pins | None:
+        """The `Pins` that move kinematic lanes along a path; None without."""
+        return self.pinned if isinstance(self.pinned, Pins) else None
 
     @property
     def compiles_in_pieces(self) -> bool:
@@ -167,14 +164,14 @@ class Scene(eqx.Module):
         whole = self.couples or self.prescribed_motion is not None or bool(find_plain_functions(self.forces))
         return not whole and not may_hide_lanes(self, self.state.lanes, self.state.position.shape[-1])
 
-    def build_lane_mask(self, tree: Any) -> Any:
+    def build_lane_mask(self, tree: PyTree) -> PyTree:
         """The tree with True in place of each array that has an entry for each lane of this scene, False elsewhere."""
         return build_lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
 
     @property
     def remembers(self) -> bool:
         """Whether a force remembers: springs that break."""
-        return any(hasattr(force, "advance") for force in self.forces)
+        return any(force.remembers for force in self.forces)
 
     @property
     def resolves_at_step_end(self) -> bool:
@@ -186,111 +183,163 @@ class Scene(eqx.Module):
         """Shape of what is decided once a scene when lanes are coupled, once a lane when not: status and step size."""
         return self.state.lanes[:-1] if self.couples else self.state.lanes
 
-    def acceleration(self, t: Time, state: Particles) -> Float[Array, "*lanes dim"]:
-        """Newton's second law, a = ΣF/m [m/s²]; held lanes do not accelerate, led ones as their path does."""
-        if self.prescribed_motion is not None:
-            state = self.prescribed_motion.prescribe(to_float_time(t), state)
-        free = None if self.held is None else 1 - self.held.astype(state.dtype)
-        fields = [f for f in self.forces if isinstance(f, Field)]
-        fields = [
-            check_load_shape(f, f.acceleration(time_for_part(f, t), state, self.mass), state.velocity) for f in fields
-        ]
-        newtons = [state.evaluate_load(f, t, self.mass) for f in self.forces if not isinstance(f, Field)]
-        total = []
-        if fields:
-            total.append(sum_terms(fields) if free is None else scale(free, sum_terms(fields)))
-        if newtons:
-            total.append(scale((1.0 if free is None else free) / self.mass, sum_terms(newtons)))
-        acceleration = sum_terms(total) if total else jnp.zeros_like(state.velocity)
-        if self.prescribed_motion is not None:
-            acceleration = self.prescribed_motion.prescribe_acceleration(to_float_time(t), state, acceleration)
-        return acceleration if self.reaction is None else self.reaction(to_float_time(t), state, acceleration)
+    def changing(self) -> "Scene":
+        """The scene with True in place of each array that a step may change, False elsewhere.
 
-    def rate(self, t: Time, state: Any) -> Any:
+        Those are the state, what contacts and the emitter declare as their `memory`, and what `advance` replaces in a
+        force with memory, which is found by tracing it and comparing identities.
+        """
+        return self.replace(
+            state=jax.tree.map(lambda _: True, self.state),
+            mass=jax.tree.map(lambda _: False, self.mass),
+            forces=tuple(build_advance_mask(force, *self._view(force)) for force in self.forces),
+            contacts=tuple(map(build_memory_mask, self.contacts)),
+            pinned=jax.tree.map(lambda _: False, self.pinned),
+            emitter=build_memory_mask(self.emitter),
+            reaction=jax.tree.map(lambda _: False, self.reaction),
+        )
+
+    def acceleration(self, t: Time, state: Particles) -> Float[Array, "*lanes dim"]:
+        """Newton's second law for particles, a = ΣF/m [m/s²]; held lanes do not accelerate, kinematic ones as their path does."""
+        return state.generalised_force(self, t)
+
+    def rate(self, t: Time, state: PyTree) -> PyTree:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.compiles_in_pieces:
             return state.rate(state.generalised_force(self, t), self.mass)
         # apart, or a method's stage would be computed anew in every neighbour that looks at it
         return state.rate(materialise(to_float_time(t), lambda: state.generalised_force(self, t)), self.mass)
 
-    def kick(self, state: Any, rate: Any, dt: ArrayLike) -> Any:
+    def kick(self, state: PyTree, rate: PyTree, dt: ArrayLike) -> PyTree:
         """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""
         return state.kick(rate, dt)
 
-    def drift(self, state: Any, dt: ArrayLike) -> Any:
+    def drift(self, state: PyTree, dt: ArrayLike) -> PyTree:
         """Positions (of bodies also orientations) moved by the velocities in `state` for a time dt."""
         return state.drift(dt, self.mass)
 
-    def normalised(self, state: Any) -> Any:
+    def normalised(self, state: PyTree) -> PyTree:
         """The state as it must be after a step, where its arrays have to agree with each other."""
-        return state.normalised(self.mass) if hasattr(state, "normalised") else state
+        return state.normalised(self.mass)
+
+    def _view(self, force: Force) -> tuple[PyTree, PyTree]:
+        """The state and the mass that a force sees."""
+        return self.state.view_for_force(force, self.mass)
 
     def averaged_over_step(self, t: Time, dt: ArrayLike) -> "Scene":
         """The scene as one step sees it: forces that jump in time replaced by their mean over the step."""
-        see = lambda f: self.state.view_for_force(f, self.mass)[0]  # noqa: E731
-        forces = tuple(
-            f.averaged_over_step(time_for_part(f, t), dt, see(f)) if hasattr(f, "averaged_over_step") else f
-            for f in self.forces
-        )
-        return eqx.tree_at(lambda scene: scene.forces, self, forces)
+        average = lambda f: f.averaged_over_step(time_for_part(f, t), dt, self._view(f)[0]) if f.jumps else f  # noqa: E731
+        return eqx.tree_at(lambda scene: scene.forces, self, tuple(map(average, self.forces)))
 
     @property
     def dissipative_symmetric(self) -> bool:
-        """Whether every force pushes back, symmetrically: an implicit step may then use conjugate gradients."""
-        flat = not hasattr(self.state, "normalised")  # what turns pushes back in no symmetric way
-        return flat and all(getattr(force, "dissipative_symmetric", False) for force in self.forces)
+        """Whether every force resists motion with a symmetric Jacobian: an implicit step may then use conjugate gradients."""
+        return not self.state.rotates and all(force.dissipative_symmetric for force in self.forces)
 
-    def linearised_at(self, t: Time, state: Any) -> "Scene":
-        """The scene as an implicit step sees it: forces that have a tangent at this state replaced by it."""
+    def linearised_at(self, t: Time, state: PyTree) -> "Scene":
+        """The scene that an implicit step differentiates at this state in place of this one."""
         state = state if self.prescribed_motion is None else self.prescribed_motion.prescribe(to_float_time(t), state)
         see = lambda f: state.view_for_force(f, self.mass)  # noqa: E731
-        return self.replace(
-            forces=tuple(
-                f.linearised_at(time_for_part(f, t), *see(f)) if hasattr(f, "linearised_at") else f for f in self.forces
-            )
-        )
+        linearise = lambda f: f.linearised_at(time_for_part(f, t), *see(f)) if f.has_linearisation else f  # noqa: E731
+        return self.replace(forces=tuple(map(linearise, self.forces)))
 
     def step(self, method: Callable, t: Time, dt: ArrayLike) -> "Scene":
-        """The scene a moment later: a step of the method, touches answered, then each part that remembers advances."""
+        """The scene after a step from t to t + dt [s]: its stages, one after the other."""
+        scene = self
+        for stage in self.stages(method, t, dt):
+            scene = stage.run(scene)
+        return scene
+
+    def stages(self, method: Callable, t: Time, dt: ArrayLike) -> "tuple[Stage, ...]":
+        """What a step consists of, in order, each a function of the scene that the stage before has left.
+
+        "move": the method's step, with what contacts resolve within it (all of them where an emitter gives each
+        particle a step of its own); "resolve contacts": each contact that projects; "prescribe": kinematic nodes are
+        put on their path, held ones back in their place; "advance memory": each force with memory.
+        """
+        emitter, motion = self.emitter, self._motion(method)
+        if emitter is None:
+            stages = [Stage("move", lambda scene: motion(scene, t, dt))]
+            stages += [
+                Stage("resolve contacts", partial(_resolve_contact, i, t=t + dt), i)
+                for i, contact in enumerate(self.contacts)
+                if (contact.response or project) is project
+            ]
+        else:
+            stages = [Stage("move", lambda scene: emitter.live(motion, scene, t, dt))]
+        if self.prescribed_motion is not None or (self.contacts and self.pinned is not None):
+            stages.append(Stage("prescribe", partial(_prescribe, start=self.state, t=t + dt)))
+        stages += [
+            Stage("advance memory", partial(_advance_force, i, t=to_float_time(t), dt=dt), i)
+            for i, force in enumerate(self.forces)
+            if force.remembers
+        ]
+        return tuple(stages)
+
+    def _motion(self, method: Callable) -> Callable:
+        """The method's step within the responses of the contacts; `project` is outside of it but under an emitter."""
         motion = Partial(free_motion, as_module(method))
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
-        # what is answered at the end of the step comes last
+        # what is resolved at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
-            motion = (
-                Partial(response, motion)
-                if is_library_part(response)
-                else Partial(respond_at_float_time, as_module(response), motion)
-            )
-        after = motion(self, t, dt) if self.emitter is None else self.emitter.live(motion, self, t, dt)
-        state = after.state
-        if self.prescribed_motion is not None:
-            state = self.prescribed_motion.prescribe(to_float_time(t + dt), state)
-        elif self.contacts and self.pinned is not None:
-            held = self.pinned[..., None]
-            state = jax.tree.map(lambda now, before: jnp.where(held, before, now), state, self.state)
-        return after.replace(state=state).advance_memory(to_float_time(t), dt)
+            if response is project and self.emitter is None:
+                continue
+            ours = is_library_part(response)
+            motion = Partial(response, motion) if ours else Partial(respond_at_float_time, as_module(response), motion)
+        return motion
 
     def advance_memory(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
-        """The scene after each force that remembers has advanced by a step from t to t + dt."""
-        forces, state = list(self.forces), self.state
-        for i, force in enumerate(forces):
-            if hasattr(force, "advance"):
-                seen, _ = state.view_for_force(force, self.mass)
-                forces[i], after = force.advance(t, dt, seen)
-                state = after if seen is state else state
-        return self.replace(state=state, forces=tuple(forces))
+        """The scene after each force with memory has advanced by a step from t to t + dt."""
+        scene = self
+        for i, force in enumerate(self.forces):
+            if force.remembers:
+                scene = _advance_force(i, scene, t, dt)
+        return scene
 
-    def replace(self, **parts: Any) -> "Scene":
+    def replace(self, **parts: PyTree) -> "Scene":
         """The scene with some of its parts replaced, unchecked."""
         names = list(parts)
         where = lambda scene: [getattr(scene, name) for name in names]  # noqa: E731
         return eqx.tree_at(where, self, list(parts.values()), is_leaf=lambda leaf: leaf is None)
 
-    def finite(self, state: Any) -> Bool[Array, "..."]:
+    having = replace
+    """The name of the first edition."""
+
+    def finite(self, state: PyTree) -> Bool[Array, "..."]:
         """Whether the state is finite, per lane, or per scene where lanes are coupled."""
         status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
         good = jnp.all(jnp.stack(status), axis=0)
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
+
+
+class Stage(NamedTuple):
+    """A named part of a step; `part` counts the contact or the force that it is about."""
+
+    name: str
+    run: Callable[[Scene], Scene]
+    part: int | None = None
+
+
+def _resolve_contact(index: int, scene: Scene, t: Time) -> Scene:
+    state = scene.contacts[index].resolve(to_float_time(t), scene.state, scene.mass)
+    return scene.replace(state=state)
+
+
+def _prescribe(scene: Scene, start: PyTree, t: Time) -> Scene:
+    """Kinematic nodes where their path is at the time t, held ones where they were at the start of the step."""
+    if scene.prescribed_motion is not None:
+        return scene.replace(state=scene.prescribed_motion.prescribe(to_float_time(t), scene.state))
+    held = jnp.asarray(scene.held)[..., None]
+    return scene.replace(state=jax.tree.map(lambda now, before: jnp.where(held, before, now), scene.state, start))
+
+
+def _advance_force(index: int, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
+    force, state = scene.forces[index], scene.state
+    seen, _ = state.view_for_force(force, scene.mass)
+    force, after = force.advance(t, dt, seen)
+    forces = (*scene.forces[:index], adopt_force(force), *scene.forces[index + 1 :])
+    # a force that sees no state of this kind, such as one at the centres of bodies, cannot change it
+    return scene.replace(state=after if seen is state else state, forces=forces)
 
 
 def trace_once(response: Callable) -> Callable:
@@ -304,13 +353,26 @@ def trace_once(response: Callable) -> Callable:
     return respond
 
 
-def free_motion(method: Callable, scene: Scene, t: Time, dt: Time) -> Scene:
+@runtime_checkable
+class SubdividingMethod(Protocol):
+    """A method that takes steps of its own within dt, and so asks forces that jump for their mean itself."""
+
+    def check_scene(self, scene: Scene) -> Scene:
+        """The scene as it is stepped; refuses what cannot be subdivided."""
+        ...
+
+    def __call__(self, system: Scene, t: Time, state: PyTree, dt: ArrayLike) -> PyTree:
+        """The state after dt."""
+        ...
+
+
+def free_motion(method: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
-    seen = method.check_scene(scene) if hasattr(method, "check_scene") else scene.averaged_over_step(t, dt)
+    seen = method.check_scene(scene) if isinstance(method, SubdividingMethod) else scene.averaged_over_step(t, dt)
     return scene.replace(state=scene.normalised(method(seen, time_for_method(method, t), scene.state, dt)))
 
 
-def loads(scene: Scene, t: Time, state: Any = None, *, per_term: bool = False) -> Any:
+def loads(scene: Scene, t: Time, state: PyTree = None, *, per_term: bool = False) -> PyTree:
     """Total force on each lane [N] (the lecture's ComputeTotalForce), at `scene.state` unless a state is given.
 
     Returns an array shaped like the velocity, for rigid bodies a `Wrench` of force [N] and torque about the centre of
@@ -323,20 +385,3 @@ def loads(scene: Scene, t: Time, state: Any = None, *, per_term: bool = False) -
     state = scene.state if state is None else state
     terms = tuple(state.evaluate_load(force, t, scene.mass) for force in scene.forces)
     return terms if per_term else state.sum_loads(terms)
-
-
-__all__ = [
-    "Contact",
-    "Field",
-    "Force",
-    "Function",
-    "Particles",
-    "Scene",
-    "as_module",
-    "build_memory_mask",
-    "find_plain_functions",
-    "free_motion",
-    "loads",
-    "project",
-    "trace_once",
-]

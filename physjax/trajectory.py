@@ -1,22 +1,23 @@
 """What a run returns: frames over time, a status per lane, and enough memory of the run to step again inside it."""
 
 import os
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import concrete_or_none
 from physjax.crossing import Crossing, find_first_crossing
 from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
 from physjax.loops import moment_at
-from physjax.particles import Particles
-from physjax.parts import Contact, Function, as_module, build_memory_mask
+from physjax.particles import Particles, callable_name
+from physjax.parts import Contact, Function, as_module, build_memory_mask, has_memory
 from physjax.scene import Scene
 
 
@@ -34,13 +35,13 @@ class Trajectory(eqx.Module):
     """
 
     time: Float[Array | np.ndarray, "frames *lanes"]
-    state: Any
+    state: PyTree
     parts: tuple
-    recorded: Any
+    recorded: PyTree
     ok: Bool[Array | np.ndarray, "..."]
     scene: Scene | None
     final_scene: Scene | None
-    stepper: Any
+    stepper: Callable | None
     dt: Float[Array | np.ndarray, "..."] | None
     first_step: Int[Array | np.ndarray, ""]
     save_every: int = eqx.field(static=True)
@@ -65,12 +66,12 @@ class Trajectory(eqx.Module):
             [ 3.  -5.8]
         """
         states = self._demand_states()
-        return (
-            states.velocity if hasattr(states, "velocity") else states.view_for_force(None, self.scene.mass)[0].velocity
-        )
+        if isinstance(states, Particles):
+            return states.velocity
+        return states.view_for_force(None, self._demand_scene("velocity").mass)[0].velocity
 
     @property
-    def method(self) -> Any:
+    def method(self) -> Callable | None:
         """The method that made the run; None when it came from a reference solver.
 
         Example:
@@ -125,7 +126,7 @@ class Trajectory(eqx.Module):
     def __repr__(self) -> str:
         """One line: what was run, for how long, and whether it held."""
         method = self.method
-        how = "" if method is None else f"{getattr(method, '__name__', type(method).__name__)}, "
+        how = "" if method is None else f"{callable_name(method)}, "
         if concrete_or_none(self.time) is None or np.ndim(self.first_step):
             return f"<Trajectory: {how}{self.steps} steps, traced or out of vmap>"
         time, ok = np.asarray(self.time), np.asarray(self.ok)
@@ -133,7 +134,7 @@ class Trajectory(eqx.Module):
         held = "ok" if ok.all() else f"{ok.size - ok.sum()} of {ok.size} blew up"
         return f"<Trajectory: {how}{len(time)} frames from t = {time.min():g} to {time.max():g} s, {shape}, {held}>"
 
-    def crossing(self, surface: Any, *, direction: int | None = None) -> Crossing:
+    def crossing(self, surface: Callable | ArrayLike, *, direction: int | None = None) -> Crossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 
         `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
@@ -167,7 +168,7 @@ class Trajectory(eqx.Module):
             (21,)
         """
         arrays = {name: getattr(self, name) for name in ("time", "ok", "first_step", "save_every", "steps")}
-        arrays |= {"method": _get_method_name(self.method), "format": RUN_FORMAT}
+        arrays |= {"method": callable_name(self.method), "format": RUN_FORMAT}
         if self.dt is not None:
             arrays["dt"] = self.dt
         if self.scene is not None and self.stepper is not None:
@@ -176,11 +177,13 @@ class Trajectory(eqx.Module):
             for keys, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 arrays[group + jax.tree_util.keystr(keys)] = leaf
         with write_atomically(path, "wb") as file:
-            np.savez_compressed(file, **{name: np.asarray(array) for name, array in arrays.items()})
+            np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()})
 
     @classmethod
     @jax.transfer_guard("allow")
-    def load(cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Any = None) -> "Trajectory":
+    def load(
+        cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Callable | None = None
+    ) -> "Trajectory":
         """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
 
         Without them frames and status are there all the same, of particles; bodies want their scene. What was recorded
@@ -199,7 +202,7 @@ class Trajectory(eqx.Module):
         demand_saved_run(path, arrays)
         return _restore_run(cls, arrays, scene, method)
 
-    def _collect_saved_trees(self) -> dict[str, Any]:
+    def _collect_saved_trees(self) -> dict[str, PyTree]:
         """The pytrees that go into a file, by the name they have there."""
         groups = {"state": self.state, "parts": self.parts, "recorded": self.recorded}
         if self.final_scene is not None:
@@ -214,7 +217,7 @@ class Trajectory(eqx.Module):
             )
         return self.scene
 
-    def _demand_states(self) -> Any:
+    def _demand_states(self) -> PyTree:
         if self.state is None:
             raise AttributeError(
                 "this trajectory holds .recorded only: simulate was told what to record instead of the state."
@@ -239,36 +242,29 @@ def _find_first_bad_step(scene, method, dt, first_step, steps):
 
 
 def select_stateful_parts(scene: Scene) -> tuple:
-    """Those of the scene's parts that remember: forces that advance, contacts that know who touches them, an emitter."""
-    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if _has_memory(part))
+    """The parts of the scene with memory: forces that advance, contacts that know who touches them, an emitter."""
+    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if has_memory(part))
 
 
-def _replace_memories(scene: Scene, state: Any, parts: tuple) -> Scene:
+def _replace_memories(scene: Scene, state: PyTree, parts: tuple) -> Scene:
     """The scene with another state, and with other memories in those of its parts that have some."""
-    parts = iter(parts)
-    renewed = lambda old: tuple(next(parts) if _has_memory(part) else part for part in old)  # noqa: E731
+    remaining = iter(parts)
+    renewed = lambda old: tuple(next(remaining) if has_memory(part) else part for part in old)  # noqa: E731
     forces, contacts, (emitter,) = renewed(scene.forces), renewed(scene.contacts), renewed((scene.emitter,))
     return scene.replace(state=state, forces=forces, contacts=contacts, emitter=emitter)
 
 
-def _has_memory(part: Any) -> bool:
-    return hasattr(part, "advance") or bool(getattr(part, "memory", ()))
-
-
-def _get_method_name(method: Any) -> str:
-    return getattr(method, "__name__", type(method).__name__)
-
-
-def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
+def _restore_run(cls: type, saved: dict[str, np.ndarray], scene: Scene | None, method: Callable | None) -> Trajectory:
     """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
+    arrays: dict[str, Array | np.ndarray] = dict(saved)
     ours, made_by = "dt" in arrays, str(arrays.pop("method"))
-    if ours and method is not None and made_by not in (_get_method_name(method), "NoneType"):
+    if ours and method is not None and made_by not in (callable_name(method), "NoneType"):
         raise ValueError(
-            f"load: the run was made with the method {made_by}, got {_get_method_name(method)}. Give the method it was made "
+            f"load: the run was made with the method {made_by}, got {callable_name(method)}. Give the method it was made "
             "with; to go on with another one, simulate(run.final_scene, ...)."
         )
     if scene is not None and ours:
-        scene = _cast_to_run(scene, arrays)
+        scene = _cast_to_run(scene, saved)
     # a run of float64 without 64-bit types stays in NumPy, where nothing is rounded
     exact = lambda array: ours and jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype  # noqa: E731
     floats = [array for array in arrays.values() if array.dtype.kind == "f"]
@@ -290,7 +286,7 @@ def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, 
             parts = _fill_tree("parts", select_stateful_parts(scene), arrays, shaped=True)
             _demand_same_contacts(select_stateful_parts(scene), parts)
     if not recorded:
-        state = _fill_tree("state", Particles(0, 0) if scene is None else scene.state, arrays)
+        state = _fill_tree("state", Particles(jnp.zeros(0), jnp.zeros(0)) if scene is None else scene.state, arrays)
     return cls(
         time=arrays["time"],
         state=state,
@@ -338,7 +334,7 @@ def _demand_same_contacts(given: tuple, found: tuple) -> None:
             )
 
 
-def _fill_tree(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> Any:
+def _fill_tree(group: str, like: PyTree, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> PyTree:
     """The pytree `like` with its leaves replaced by that group of arrays, `shaped` as they are, of parts also with frames."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]

@@ -23,13 +23,14 @@ FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 
 FLOORS = (
-    {"vectors", "checks", "files", "text", "backend", "loops", "closures", "mesh_files"},
+    {"vectors", "checks", "files", "text", "backend", "loops", "closures", "mesh_files", "old_names"},
     {"roots", "meshes", "projectile"},
     {"particles", "quantities"},
     {"parts"},
+    {"pins"},
     {"scene"},
     {"select", "crossing"},
-    {"trajectory", "pins"},
+    {"trajectory"},
     {"physics", "stepping"},
     {"show"},
     {"study"},

@@ -30,8 +30,8 @@ def _run_stability(name: str, out: str, steps: int) -> None:
 
     from physjax.checks import as_positive_integer, demand_known
     from physjax.files import ensure_writable_folder
+    from physjax.particles import callable_name
     from physjax.scenes import FAILURES, SCENES
-    from physjax.stepping.registry import method_name
     from physjax.study import stability
     from physjax.study.stability.survey import find_fastest_moment
     from physjax.text import describe_machine, format_seconds
@@ -54,7 +54,7 @@ def _run_stability(name: str, out: str, steps: int) -> None:
     if name in FAILURES:
         failure = cast("Failure", problem)
         reported = stability.explain(scene, failure.method, failure.dt, steps=failure.steps)
-        print(f"{method_name(failure.method)} with dt = {format_seconds(failure.dt)}: {reported}")
+        print(f"{callable_name(failure.method)} with dt = {format_seconds(failure.dt)}: {reported}")
     print(f"Measured on {describe_machine()}.")
 
 

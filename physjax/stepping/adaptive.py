@@ -61,7 +61,7 @@ class Adaptive(eqx.Module):
 
     def check_scene(self, scene: Any) -> Any:
         """The scene as it is; a ValueError where something is answered once a dt, whatever the steps in it."""
-        late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if hasattr(f, "advance")]
+        late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if f.remembers]
         late += [
             f"{type(contact).__name__} with response=contacts.project"
             for contact in scene.contacts

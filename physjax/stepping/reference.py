@@ -50,7 +50,7 @@ def ode_term(scene: Scene) -> "diffrax.ODETerm":
 
 def discontinuities(scene: Scene) -> Array:
     """Times [s] at which a force of the scene jumps, sorted: an adaptive solver must stop there."""
-    times = [jnp.ravel(jnp.asarray(t)) for force in scene.forces for t in getattr(force, "discontinuities", tuple)()]
+    times = [jnp.ravel(jnp.asarray(t)) for force in scene.forces for t in force.discontinuities()]
     return jnp.sort(jnp.concatenate(times)) if times else jnp.zeros(0, scene.state.dtype)
 
 
@@ -80,7 +80,7 @@ def reference(
         raise ValueError("reference: times must be a list of ascending finite numbers >= 0 [s].")
     as_real_quantity("rtol", rtol, above=0.0)
     as_real_quantity("atol", atol, above=0.0)
-    if scene.emitter is not None or any(hasattr(force, "advance") for force in scene.forces):
+    if scene.emitter is not None or scene.remembers:
         raise ValueError(
             "reference: the scene has parts that remember, which an ordinary differential equation has not. Remove them."
         )

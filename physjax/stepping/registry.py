@@ -44,8 +44,3 @@ def promises(
         return method
 
     return attach
-
-
-def method_name(method: Callable) -> str:
-    """What a method is called in tables."""
-    return getattr(method, "__name__", None) or type(method).__name__

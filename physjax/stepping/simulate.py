@@ -22,7 +22,7 @@ from physjax.backend import MIN_LANES_TO_SELECT, split_compilation
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
-from physjax.parts import as_module, build_memory_mask, find_plain_functions
+from physjax.parts import as_module, find_plain_functions
 from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, select_stateful_parts
@@ -83,7 +83,7 @@ def simulate(
 
 def _run_steps(scene, method, dt, first_step, frames, save_every, record):
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
-    changing = find_changing_parts(scene, dt)
+    changing = scene.changing()
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
@@ -180,7 +180,7 @@ def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame
     One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
-    changing = find_changing_parts(scene, dt)
+    changing = scene.changing()
     moving, still = eqx.partition(scene, changing)
 
     def step(i, moving):
@@ -227,24 +227,6 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
     states = sample_states(scene, method, dt, steps, 1)
     end = jax.tree.map(lambda leaf: leaf[-1], states)
     return StateAfter(end, steps, dt, scene.finite(end))
-
-
-def find_changing_parts(scene: Scene, dt: ArrayLike) -> Any:
-    """Mask over the scene's arrays: the state, what contacts remember, and what `advance` replaces in a force.
-
-    The last is found by tracing it and comparing identities.
-    """
-    mask = []
-
-    def trace(scene):
-        after = scene.advance_memory(jnp.zeros((), scene.state.dtype), dt)
-        mask.append(jax.tree.map(lambda before, now: before is not now, scene, after))
-        return after
-
-    jax.eval_shape(trace, scene)
-    contacts = tuple(map(build_memory_mask, scene.contacts))
-    state, emitter = jax.tree.map(lambda _: True, scene.state), build_memory_mask(scene.emitter)
-    return mask[0].replace(state=state, contacts=contacts, emitter=emitter)
 
 
 def _check_first_step(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Array, Array]:

@@ -59,7 +59,7 @@ class Problem(NamedTuple):
     def is_ode(self) -> bool:
         """Whether the scene is an ordinary differential equation: no contacts, no emitter, and no force that remembers."""
         jumps = self.scene.contacts or self.scene.emitter is not None
-        return not jumps and not any(hasattr(force, "advance") for force in self.scene.forces)
+        return not jumps and not self.scene.remembers
 
     def reference(self) -> Trajectory:
         """The scene at `times`, in float64, as true as it can be had: NumPy arrays.

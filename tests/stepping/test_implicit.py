@@ -12,7 +12,7 @@ import pytest
 
 from physjax import Particles, Pins, Scene, forces, lattices, methods, ode_term, simulate
 from physjax.physics.springs import Springs
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.stepping.krylov import conjugate_gradients, stabilised_biconjugate_gradients
 from physjax.stepping.methods import ImplicitEuler
 from physjax.stepping.simulate import sample_states

@@ -11,7 +11,7 @@ import pytest
 
 from physjax import Particles, Scene, forces, methods, ode_term, reference, simulate
 from physjax.physics.forces import independent
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import sample_states
 from physjax.vectors import dot, norm

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from physjax import Particles, Scene, contacts, forces, lattices, methods, simulate
 from physjax.physics.forces import independent
-from physjax.scene import Force
+from physjax.parts import Force
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import state_after
 

@@ -38,6 +38,7 @@ from physjax.loops import (
     to_float_time,
 )
 from physjax.particles import Particles, demand_particles
+from physjax.parts import ParticleSource
 from physjax.physics.emitters.appearance import Appearance, Look
 from physjax.physics.emitters.shapes import Source, direction_in_cone, unit_direction
 from physjax.vectors import broadcast_vector, components, scale, stack_components
@@ -62,7 +63,7 @@ class Birth(NamedTuple):
     velocity: Float[Array, "*births dim"]
 
 
-class Emitter(eqx.Module):
+class Emitter(ParticleSource):
     """A pool of particles born from a source: `Scene(emitter.unborn(), ..., emitter=emitter)`.
 
     Births come one by one at a `rate` [1/s], or in bursts of `burst` particles (of the whole pool by default) `every` so

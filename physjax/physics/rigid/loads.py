@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from physjax.checks import as_real_quantity, quantity
 from physjax.loops import Time
 from physjax.particles import Particles
-from physjax.parts import Force, as_module
+from physjax.parts import Force, adopt_force
 from physjax.physics.rigid.inertia import Inertia, check_quaternion
 from physjax.physics.rigid.spatial import (
     Load,
@@ -199,43 +199,44 @@ class AtPoint(Load):
     """
 
     point: Float[Array, "..."] = quantity("point of the body", "m", kind="place")
-    force: Force = eqx.field(converter=as_module)
+    force: Force = eqx.field(converter=adopt_force)
 
     def __check_init__(self):
-        if isinstance(self.force, Load) or hasattr(self.force, "advance"):
+        if isinstance(self.force, Load) or self.force.remembers:
             raise TypeError(f"AtPoint: got {type(self.force).__name__}, expected a force on particles that forgets.")
 
     @property
     def couples(self) -> bool:
         """Whether the force ties bodies together."""
-        return getattr(self.force, "couples", True)
+        return self.force.couples
 
     @property
     def sees_moments(self) -> bool:
         """Whether the force asks for the time as a moment."""
-        return getattr(self.force, "sees_moments", False)
+        return self.force.sees_moments
+
+    def discontinuities(self) -> tuple[Array, ...]:
+        """Times at which the force jumps [s]."""
+        return self.force.discontinuities()
 
     @property
-    def discontinuities(self) -> Callable:
-        """Times at which the force jumps [s], where it does."""
-        return self.force.discontinuities
+    def jumps(self) -> bool:
+        """Whether the force jumps in time."""
+        return self.force.jumps
+
+    def averaged_over_step(self, t: Time, dt: ArrayLike, state: RigidBodies) -> "AtPoint":
+        """The mean of the force over a step; it depends on where the point is, not on how fast it moves."""
+        where = point(state, self.point)
+        return AtPoint(self.point, self.force.averaged_over_step(t, dt, Particles(where, jnp.zeros_like(where))))
 
     @property
-    def averaged_over_step(self) -> Callable:
-        """The mean of the force over a step, where it has one; it looks at when, not at how fast."""
-        mean = self.force.averaged_over_step
+    def has_potential(self) -> bool:
+        """Whether the force is conservative."""
+        return self.force.has_potential
 
-        def placed(t, dt, bodies):
-            where = point(bodies, self.point)
-            return AtPoint(self.point, mean(t, dt, Particles(where, jnp.zeros_like(where))))
-
-        return placed
-
-    @property
-    def potential(self) -> Callable:
-        """Its energy [J], where it has one."""
-        energy = self.force.potential
-        return lambda t, bodies, inertia: energy(t, self._build_point_particles(bodies, inertia), inertia.mass)
+    def potential(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> Array | None:
+        """Its potential energy [J], if it has one."""
+        return self.force.potential(t, self._build_point_particles(state, mass), mass.mass)
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""

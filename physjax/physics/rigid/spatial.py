@@ -118,6 +118,11 @@ class RigidBodies(NamedTuple):
         """What the errors of a path are measured by: position [m] and orientation [1] beside each other, `(*lanes, 7)`."""
         return np.concatenate([self.position, self.orientation], axis=-1)
 
+    @property
+    def rotates(self) -> bool:
+        """Bodies rotate: their Jacobian is not symmetric."""
+        return True
+
     # loads
 
     def view_for_force(self, force: Any, mass: Inertia) -> tuple[Any, Any]:

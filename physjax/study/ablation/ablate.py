@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import as_real_quantity
+from physjax.particles import callable_name
 from physjax.scene import Scene
-from physjax.stepping.registry import method_name
 from physjax.stepping.simulate import simulate
 from physjax.study.ablation.variants import Variant, list_pair_variants, list_variants
 from physjax.study.stability.limits import check_method
@@ -178,7 +178,7 @@ def ablate(
         _compare_with_whole(*each, whole=measured[0], clock=times[0], threshold=threshold)
         for each in zip(names, measured, times, costs, strict=True)
     ]
-    return Ablation(effects[0], tuple(effects[1:]), threshold, method_name(method), float(dt), tuple(notes))
+    return Ablation(effects[0], tuple(effects[1:]), threshold, callable_name(method), float(dt), tuple(notes))
 
 
 def _compare_with_whole(

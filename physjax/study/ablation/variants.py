@@ -141,4 +141,4 @@ def remove_lane(scene: Scene, name: str, lane: int) -> Variant:
 
 def _refers_to_lanes(force: Any) -> bool:
     """Whether a force names lanes by their number, or may do so unseen."""
-    return getattr(force, "couples", True) and not isinstance(force, forces.Gravitation)
+    return force.couples and not isinstance(force, forces.Gravitation)

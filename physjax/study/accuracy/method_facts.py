@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.particles import Particles, demand_particles
+from physjax.particles import Particles, callable_name, demand_particles
 from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.reference import cast_floats
-from physjax.stepping.registry import method_name
-from physjax.stepping.simulate import find_changing_parts, sample_states
+from physjax.stepping.simulate import sample_states
 from physjax.study.problem import Problem
 
 
@@ -106,7 +105,7 @@ def draw_random_push(scene: Scene) -> Any:
 def stack_copies(scene: Scene, count: int) -> Scene:
     """So many of a scene at once, along a new leading axis of what a step changes and of every number that each lane has."""
     many = lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape))  # noqa: E731
-    lanes, remembered = scene.state.lanes, find_changing_parts(scene, jnp.ones((), scene.state.dtype))
+    lanes, remembered = scene.state.lanes, scene.changing()
 
     def wider(part, changes):
         # what couples lanes, such as springs, has numbers of its own that serve all scenes as they are
@@ -125,8 +124,8 @@ def stack_copies(scene: Scene, count: int) -> Scene:
 def method_title(method: Callable) -> str:
     """What a method is called in tables, an adaptive one after what it subdivides."""
     if not isinstance(method, Adaptive):
-        return method_name(method)
-    return f"adaptive {method_name(getattr(method.method, 'function', method.method))}"
+        return callable_name(method)
+    return f"adaptive {callable_name(getattr(method.method, 'function', method.method))}"
 
 
 def smallest_size(scene: Scene) -> float:

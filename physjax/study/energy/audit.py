@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.loops import Moment, Time, moment_at, to_float_time
-from physjax.parts import force_name
+from physjax.particles import callable_name
 from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
 from physjax.physics.rigid.response import collide, fold_body_flights
 from physjax.scene import Scene, free_motion, project
@@ -83,7 +83,7 @@ def list_causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
 
 def name_parts(parts: tuple) -> list[str]:
     """What forces or contacts are called, numbered where several are called the same."""
-    names, seen = [force_name(part) for part in parts], Counter()
+    names, seen = [callable_name(part) for part in parts], Counter()
     several = {name for name, count in Counter(names).items() if count > 1}
     for i, name in enumerate(names):
         seen[name] += 1
@@ -93,7 +93,7 @@ def name_parts(parts: tuple) -> list[str]:
 
 def _may_lose_energy(force: Any) -> bool:
     """Whether a force may lose energy between two steps: it remembers, and has a potential."""
-    return hasattr(force, "advance") and hasattr(force, "potential")
+    return force.remembers and force.has_potential
 
 
 def cast_to_float64(tree: Any) -> Any:
@@ -122,7 +122,7 @@ def _measure_stock(t: Array, scene: Scene) -> EnergyBudget:
     t, state = t.astype(jnp.float64), scene.state
     found = {"kinetic": energy.kinetic(scene, t, state)}
     for name, force in zip(name_parts(scene.forces), scene.forces, strict=True):
-        if hasattr(force, "potential"):
+        if force.has_potential:
             found[f"potential of {name}"] = _potential(force, scene, t, state)
     amounts = _measure_quantities(scene, t, state)
     kinds = (energy.ENERGY, energy.MOMENTUM, energy.ANGULAR_MOMENTUM)
@@ -279,13 +279,13 @@ def _compute_rates(whole: Scene, scene: Scene, t: Array, state: Any) -> tuple[An
     """Time derivative of the state, and what each force, and what holds the scene, brings in a second."""
     rate = scene.rate(t, state)
     seen = state if scene.prescribed_motion is None else scene.prescribed_motion.prescribe(t, state)
-    seen = seen.on_pivot(scene.mass) if hasattr(seen, "on_pivot") else seen
+    seen = seen.on_pivot(scene.mass) if seen.rotates else seen
     works = [_transfer_rates(whole, t, seen, _single_force_rate(scene, t, seen, force)) for force in scene.forces]
     holding = _transfer_rates(whole, t, seen, rate)
     for work in works:
         holding = _subtract(holding, work)
     for i, force in enumerate(whole.forces):
-        if hasattr(force, "potential"):  # what is stored has not been brought
+        if force.has_potential:  # what is stored has not been brought
             stored = partial(_potential, force, whole)
             _, stores = jax.jvp(stored, (t, seen), (jnp.ones_like(t), rate))
             works[i] = works[i] | {"energy": works[i]["energy"] + stores}
@@ -295,7 +295,7 @@ def _compute_rates(whole: Scene, scene: Scene, t: Array, state: Any) -> tuple[An
 def _single_force_rate(scene: Scene, t: Array, state: Any, force: Any) -> Any:
     """Time derivative of the state if this force were the only one."""
     load = state.sum_loads((state.evaluate_load(force, t, scene.mass),))
-    return state.rate(load if hasattr(state, "own_spin") else scale(1 / scene.mass, load), scene.mass)
+    return state.rate(load if state.rotates else scale(1 / scene.mass, load), scene.mass)
 
 
 def _transfer_rates(scene: Scene, t: Array, state: Any, rate: Any) -> dict[str, Array]:

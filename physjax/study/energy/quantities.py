@@ -45,7 +45,7 @@ def potential(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
         196.0
     """
     see = lambda f: state.view_for_force(f, scene.mass)  # noqa: E731
-    terms = [f.potential(t, *see(f)) for f in scene.forces if hasattr(f, "potential")]
+    terms = [f.potential(t, *see(f)) for f in scene.forces if f.has_potential]
     return summed(scene, sum(terms, jnp.zeros_like(state.position[..., 0])))
 
 
@@ -80,13 +80,13 @@ def angular_momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..
     r, p = state.position, state.linear_momentum(scene.mass)
     if r.shape[-1] == 2:
         return summed(scene, r[..., 0] * p[..., 1] - r[..., 1] * p[..., 0])
-    spin = cross(r, p) + state.own_spin(scene.mass) if hasattr(state, "own_spin") else cross(r, p)
+    spin = cross(r, p) + state.own_spin(scene.mass) if state.rotates else cross(r, p)
     return jnp.sum(spin, axis=-2) if scene.couples else spin
 
 
 def _angular_momentum_size(scene: Scene, state: Any) -> Array:
     arms = norm(state.position) * norm(state.linear_momentum(scene.mass))
-    return arms + norm(state.own_spin(scene.mass)) if hasattr(state, "own_spin") else arms
+    return arms + norm(state.own_spin(scene.mass)) if state.rotates else arms
 
 
 def summed(scene: Scene, per_lane: Array) -> Array:

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import as_real_quantity
-from physjax.particles import Particles
-from physjax.parts import Force, as_module, force_name
+from physjax.particles import Particles, callable_name
+from physjax.parts import Force, as_module
 from physjax.physics.springs.springs import Springs
 from physjax.scene import Scene
-from physjax.stepping.registry import method_name
 from physjax.study.stability.linearisation import (
     DRIFT_RATE_SHARE,
     ROUNDING_RATE_SHARE,
@@ -100,7 +99,7 @@ def region(
     """
     with jax.enable_x64(True):
         z = np.linspace(*real, points[0]) + 1j * np.linspace(*imaginary, points[1])[:, None]
-        return Region(method_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
+        return Region(callable_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
 
 
 def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
@@ -116,7 +115,7 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
     """
     with jax.enable_x64(True):
         scene, state = prepare_linearisation(scene, at)
-        module, name = check_method(method), method_name(method)
+        module, name = check_method(method), callable_name(method)
         motion = linearise(scene, state)
         fastest = np.abs(motion.rates()).max(axis=-1)
         if not np.any(fastest > 0):
@@ -292,7 +291,7 @@ def _attribute_mode(scene: Scene, state: Particles, motion: SmallMotion, block: 
     size = np.sum(np.abs(moved) ** 2, axis=-1)
     node = tuple(int(i) for i in np.unravel_index(np.argmax(size), size.shape))
     spring = _find_worst_spring(force, state, moved, kind, block) if isinstance(force, Springs) else None
-    return ("stiffness", "damping")[kind], force_name(force), spring, node, complex(rate)
+    return ("stiffness", "damping")[kind], callable_name(force), spring, node, complex(rate)
 
 
 @jax.jit

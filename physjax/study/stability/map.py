@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import as_real_quantity
+from physjax.particles import callable_name
 from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping import methods as ours
 from physjax.stepping.reference import cast_floats
-from physjax.stepping.registry import method_name
 from physjax.stepping.simulate import sample_states
 from physjax.study.stability.limits import check_method, limit
 
@@ -96,7 +96,7 @@ def map(
         )
     verdict = np.where(error <= INACCURATE_ERROR, 0, np.where(error <= DIVERGED_ERROR, 1, 2))
     actual = np.broadcast_to(duration / JUDGED_FRAMES / counts, error.shape)
-    names = tuple(method_name(method) for method in methods)
+    names = tuple(callable_name(method) for method in methods)
     return StabilityMap(names, name, values, actual, verdict, error, predicted, duration)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, contacts, forces, methods, simulate
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.stepping.simulate import sample_states
 
 SECOND_ORDER = (methods.verlet, methods.midpoint, methods.rk4)

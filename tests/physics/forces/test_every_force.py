@@ -118,7 +118,7 @@ def test_value_and_derivatives_are_finite_at_rest_and_at_nothing(case):
         def weighed(scene):
             t = jnp.zeros((), jnp.float32)
             parts = [scene.acceleration(t, scene.state)]
-            if hasattr(scene.forces[0], "averaged_over_step"):
+            if scene.forces[0].jumps:
                 parts += [scene.averaged_over_step(t, t + 0.1).acceleration(t, scene.state)]
             return sum(jnp.vdot(part, jnp.arange(1.0, 1 + part.size, dtype=part.dtype)) for part in parts)
 
@@ -141,12 +141,12 @@ def test_values_have_the_dtype_and_the_shape_of_the_state(case, precision):
     (force,) = scene.forces
     value = jax.eval_shape(force, 0.5, state, scene.mass)
     assert (value.shape, value.dtype) == ((LANES, case.dim), precision.dtype)
-    if hasattr(force, "potential"):
+    if force.has_potential:
         energy = jax.eval_shape(force.potential, 0.5, state, scene.mass)
         assert (energy.shape, energy.dtype) == ((LANES,), precision.dtype)
 
 
-CONSERVATIVE = {name: case for name, case in CASES.items() if hasattr(case.build(**arguments(case)), "potential")}
+CONSERVATIVE = {name: case for name, case in CASES.items() if case.build(**arguments(case)).has_potential}
 
 
 @pytest.mark.parametrize("case", CONSERVATIVE.values(), ids=CONSERVATIVE)

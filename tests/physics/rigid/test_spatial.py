@@ -25,7 +25,7 @@ from physjax import (
     simulate,
     springs,
 )
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import sample_states
 from physjax.study import energy

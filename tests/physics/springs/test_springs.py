@@ -297,7 +297,7 @@ def test_overstretched_springs_part_for_good(layout):
 
 def test_springs_that_cannot_break_remember_nothing():
     springs, state = chain(4, 100.0)
-    assert not hasattr(springs, "advance")
+    assert not springs.remembers
     assert springs.unbroken is None
     assert springs.breaks_at is None
     assert simulate(Scene(state, 1.0, (springs,)), methods.euler, dt=0.1, steps=2).parts == ()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, contacts, forces, lattices, methods, springs
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.scenes import SCENES
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import sample_states

@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from physjax import Particles, Scene, aim_at, contacts, forces, methods, projectile, reference, simulate
-from physjax.scene import as_module
+from physjax.parts import as_module
 from physjax.study.inverse.shooting import AimProblem, Launch, find_nearest_launch
 from physjax.vectors import norm
 
