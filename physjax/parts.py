@@ -1,7 +1,7 @@
 """The parts of a scene: what a force and a contact can do, and how they are prepared when a scene is built."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import ClassVar
 
@@ -196,6 +196,10 @@ class Contact(eqx.Module):
     @abstractmethod
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after contact; lanes that are not in contact stay as they are."""
+
+    def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray] | None:
+        """Polygons `(corners, 3)` [m] that show the surface in a box in space; None: they follow from the signed distance."""
+        return None
 
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
         """The contact with the memory of some lanes cleared, because other particles take their place."""

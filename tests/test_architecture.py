@@ -163,6 +163,16 @@ def test_every_exported_name_exists_and_is_documented():
     )
 
 
+@pytest.mark.parametrize("name", physjax.__all__)
+def test_tab_shows_what_is_ours_and_nothing_else(name):
+    face = getattr(physjax, name)
+    if inspect.ismodule(face):
+        assert sorted(dir(face)) == sorted(face.__all__)
+        assert not [item for item in dir(face) if item.startswith("_")]
+        foreign = [item for item in dir(face) if inspect.ismodule(getattr(face, item))]
+        assert all(getattr(face, item).__name__.startswith("physjax.") for item in foreign)
+
+
 @pytest.mark.parametrize("file", [file for file in FILES if room(file) in {"physics", "stepping", "vectors"}])
 def test_vectors_are_written_by_components_and_never_scattered(file):
     slow = {"einsum", "tensordot", "matmul", "vdot", "linalg"}

@@ -101,12 +101,14 @@ class Kerb(contacts.Surface):
         y = jnp.where(edge, above, jnp.where(face, 0.0, 1.0))
         return unit(stack_components([-x, y, jnp.zeros_like(x)]))
 
-    def profile(self, low: float, high: float) -> np.ndarray:
-        """The outline in the plane of x and y between two places along x [m], the same at every z."""
+    def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+        """Ground, face and top from side to side of the box: they stay sharp, whatever grid the box is drawn with."""
         at, height = float(self.at), float(self.height)
-        if not low < at < high:
-            return np.array([[low, height * (at <= low)], [high, height * (at <= low)]])
-        return np.array([[low, 0.0], [at, 0.0], [at, height], [high, height]])
+        line = np.array([[low[0], height * (at <= low[0])], [high[0], height * (at < high[0])]])
+        if low[0] < at < high[0]:
+            line = np.array([line[0], [at, 0.0], [at, height], line[1]])
+        near, far = (np.column_stack([line, np.full(len(line), side)]) for side in (low[2], high[2]))
+        return list(np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=1))
 
     def _face_distances(self, position: Array) -> tuple[Array, Array]:
         """Signed distances in front of the face and above the top [m]."""

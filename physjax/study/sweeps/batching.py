@@ -170,7 +170,6 @@ def compile_batch(program: LaneProgram, cut: Layout, devices: tuple[jax.Device, 
 
     mesh = Mesh(np.asarray(devices), ("lanes",))
     spec = PartitionSpec("lanes")
-    platform = devices[0].platform
     if len(devices) > 1:
         batch = jax.shard_map(batch, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     shapes = [
