@@ -9,11 +9,11 @@ resumed; `--limit` seconds end it. `--part report` judges and draws what there i
 
 Promises: on every scene of the gallery and 40 random ones, one search serves three errors; each recommended run is made
 by `.simulate()` and judged by a reference solution other than the search's (a closed form; our own rk4 where the search
-had diffrax; verlet where it had our rk4), and timed in turn with the fastest run of an exhaustive search, steps √2 apart: of every
-method of the registry and adaptive rk4 on smooth scenes; of what the search would try first where there are contacts,
-which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ by a percent; diffrax's solvers
-under vmap, each at the loosest of its tolerances, a power of ten apart, that meets the error (Kvaerno5 only on small
-scenes; a tenth or twentieth of the duration where a run would take minutes).
+had diffrax; verlet where it had our rk4), and timed in turn with the fastest run of an exhaustive search, steps √2
+apart: of every method of the registry and adaptive rk4 on smooth scenes; of what the search would try first where there
+are contacts, which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ by a percent;
+diffrax's solvers under vmap, each at the loosest of its tolerances, a power of ten apart, that meets the error (Kvaerno5
+only on small scenes; a tenth or twentieth of the duration where a run would take minutes).
 """
 
 import json
