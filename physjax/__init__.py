@@ -1,7 +1,11 @@
 """Game physics in JAX: describe a scene once, run it under any method, batch it, differentiate it.
 
-Every name shows an example that runs once these lines have run: a shot, its flight, an oscillator, a flag, a brick that
-turns, a fountain.
+Nouns are records (`Particles`, `Scene`, `Trajectory`), verbs are functions (`simulate`, `sweep`, `solve`), and the modules
+are namespaces: `forces`, `contacts`, `methods`, `plot`, ... The README has the map of the package, two walks through it (dt,
+and a force's value) and a glossary.
+
+Every name has an example that runs after these lines: a shot, its flight, an oscillator, a flag, a tumbling brick, a
+fountain.
 
 Example:
     >>> import jax, jax.numpy as jnp, numpy as np
