@@ -214,7 +214,7 @@ class Contact(eqx.Module):
         return self.signed_distance(t, state.position)
 
     def demand_fit(self, state: PyTree, mass: PyTree) -> None:
-        """Raise a TypeError for a state that cannot be in contact with it, a ValueError for lanes that start on the wrong side."""
+        """Raise a TypeError for a state of another kind, and a ValueError for lanes that start on the wrong side."""
         demand_particles("contacts", state, "rigid bodies need rigid.SurfaceContact(hull, plane)")
         demand_start_outside(self, state)
 
