@@ -22,11 +22,14 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what is measured is this checkout, installed or not
 
 import jax
+from jax.stages import Wrapped
+from jaxtyping import PyTree
 
 import physjax
 from physjax.files import ensure_writable_folder, write_atomically
@@ -58,7 +61,7 @@ class Bar(NamedTuple):
 
     @property
     def met(self) -> bool:
-        """Whether it is."""
+        """Whether it is met."""
         return self.measured >= self.wanted if self.relation == ">=" else self.measured <= self.wanted
 
 
@@ -71,10 +74,10 @@ def record_compilations() -> Iterator[list[float]]:
 
 
 class Missing(Exception):
-    """Something that this machine lacks, in plain words."""
+    """Something that this machine lacks."""
 
 
-def import_optional(module: str, package: str | None = None) -> Any:
+def import_optional(module: str, package: str | None = None) -> ModuleType:
     """An installed module, or `Missing` with what to install."""
     try:
         return importlib.import_module(module)
@@ -99,13 +102,13 @@ def compile_c(source: str) -> ctypes.CDLL:
 
 
 def time_side_by_side(
-    contenders: Mapping[str, Callable[[], Any]],
+    contenders: Mapping[str, Callable[[], object]],
     repeats: int,
     check: Callable[[str, Any], None] = lambda name, found: None,
 ) -> tuple[dict[str, Timing], dict[str, str]]:
     """Let all contenders take a turn in each of `repeats` rounds, after a first call whose result is `check`ed.
 
-    Nothing is timed before all are checked. Returns the times, and the reasons of those whose first call failed.
+    Nothing is timed before all are checked. Returns the times, and why the others failed in their first call.
     """
     firsts, failed = {}, {}
     for name, run in contenders.items():
@@ -140,13 +143,13 @@ def time_imports(modules: Sequence[str], repeats: int) -> dict[str, float]:
     return {module: min(taken) for module, taken in seconds.items()}
 
 
-def measure_temporary_bytes(function: Any, *arguments: Any) -> int:
+def measure_temporary_bytes(function: Wrapped, *arguments: PyTree) -> int:
     """Memory that a compiled function needs besides its arguments and results [bytes]."""
     return function.lower(*arguments).compile().memory_analysis().temp_size_in_bytes
 
 
 def describe_machine() -> dict[str, Any]:
-    """What was measured on: device, processor, cores this process may use, load, versions, flags."""
+    """The machine: device, processor, cores this process may use, load, versions, flags."""
     device = jax.devices()[0]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     return {
@@ -180,22 +183,24 @@ def has_avx512() -> bool:
     return "avx512f" in (_read_cpuinfo("flags") or "").split()
 
 
-def parse_options(about: str) -> tuple[bool, Path]:
+def parse_options(about: str | None) -> tuple[bool, Path]:
     """The command line: whether to be quick, and the folder of the results, tried before the work."""
     given = parse_arguments(build_parser(about))
     return given.quick, given.out
 
 
-def build_parser(about: str) -> argparse.ArgumentParser:
+def build_parser(about: str | None) -> argparse.ArgumentParser:
     """The options that every benchmark has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small sizes: shows that everything runs, proves nothing")
+    parser.add_argument(
+        "--quick", action="store_true", help="small sizes: shows that everything runs, measures nothing"
+    )
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="where results go (%(default)s)")
     return parser
 
 
 def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """What was given, the folder of the results tried."""
+    """The parsed arguments; the folder of the results has been tried."""
     given = parser.parse_args()
     try:
         given.out = ensure_writable_folder(given.out)
@@ -205,7 +210,7 @@ def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def result_path(folder: Path, name: str, quick: bool, ending: str) -> Path:
-    """`<name>-<device>-jax<version>.<ending>`; a quick run, which proves nothing, is marked as such."""
+    """`<name>-<device>-jax<version>.<ending>`; a quick run, which measures nothing, is marked as such."""
     device = re.sub(r"[^a-z0-9]+", "-", jax.devices()[0].device_kind.lower()).strip("-")
     return folder / f"{name}-{device}-jax{jax.__version__}{'-quick' if quick else ''}.{ending}"
 
@@ -217,7 +222,7 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
         file.write("\n")
 
 
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
     """A table whose first column is text and whose others are numbers."""
     cells = [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in rows]
     print(f"\n{title}\n{textwrap.indent(format_table(head, cells), '  ')}")
@@ -261,7 +266,7 @@ def print_rates(title: str, unit: str, rows: Sequence[Mapping[str, Any]], ours: 
 
 
 def print_bars(bars: Sequence[Bar], quick: bool) -> None:
-    """What was promised, what was measured."""
+    """Each bar, what was measured, and whether it is met."""
     verdicts = ["-" if quick else "met" if bar.met else "MISSED" for bar in bars]
     lines = [
         [bar.name, bar.measured, f"{bar.relation} {bar.wanted:g}", verdict]
@@ -276,7 +281,7 @@ def draw_bar_chart(
     foot: str,
     labels: Mapping[str, str] | None = None,
 ) -> None:
-    """Horizontal bars on a logarithmic axis: a panel is (title, axis label, rows as made by `row`).
+    """Horizontal bars on a logarithmic axis: a panel is (title, axis label, rows as made by `make_row`).
 
     Bars are the best of the turns, ticks their median. `labels` say what the families mean where it is not
     their own name. The file is whole or absent.
@@ -312,7 +317,7 @@ def draw_bar_chart(
 
 
 def print_progress(what: str) -> None:
-    """Progress, apart from the results."""
+    """Progress, on standard error, so that it stays apart from the results."""
     print(what, file=sys.stderr, flush=True)
 
 

@@ -4,16 +4,19 @@ Values are looked at only where they are concrete. Inside `jit`, `vmap` and `gra
 a bad value there becomes a status of the run (`Trajectory.ok`), never an exception.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Float
+
+NestedArrayLike = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+"""What users give for numbers: a number, an array, or lists of them."""
 
 
 def concrete_or_none(value: Any) -> np.ndarray | None:
@@ -90,7 +93,7 @@ def demand_direction(name: str, vector: Array) -> None:
         demand_all(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
 
 
-VECTOR_KINDS = ("vector", "place")
+VECTOR_KINDS = ("vector", "place", "corner")
 """Kinds with one component for each dimension of space."""
 KINDS = ("number", *VECTOR_KINDS, "axial", "rotation", "tensor")
 ENTRY_AXIS_COUNT = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, "memory": 0, None: 0}
@@ -100,8 +103,8 @@ ENTRY_AXIS_COUNT = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, 
 class Quantity(NamedTuple):
     """What a field of a part of a scene is: its name and unit, what kind of number, what there is one of it for, its bounds.
 
-    `kind`: a "number", a "vector", a "place", an "axial" vector (a number in the plane), a "rotation"
-    (a quaternion) or a "tensor" `(dim, dim)`.
+    `kind`: a "number", a "vector", a "place", a "corner" (a place of which each component bounds its own axis alone), an
+    "axial" vector (a number in the plane), a "rotation" (a quaternion) or a "tensor" `(dim, dim)`.
     `per`: one for all lanes or one per "lane"; a "table" of any length, one for all lanes or one per lane; one per
     "point", "joint" or "spring"; "memory" of what each lane did in a run; None is shared by all lanes, whatever its shape.
     """
@@ -134,6 +137,27 @@ class Quantity(NamedTuple):
         if self.at_most is not None:
             good = good & (value <= self.at_most)
         return good
+
+
+if TYPE_CHECKING:
+    # To a type checker these are descriptors: a field is given numbers of any kind, and read as the array that `quantity`
+    # has converted them to. Checkers know of `converter=` only where it is written in the class itself.
+
+    class Numbers:
+        """The annotation of a field made with `quantity`: any numbers are given, an array is read."""
+
+        def __get__(self, instance: object, owner: type | None = None) -> Array: ...
+        def __set__(self, instance: object, value: NestedArrayLike) -> None: ...
+
+    class OptionalNumbers:
+        """The same where None means absent."""
+
+        def __get__(self, instance: object, owner: type | None = None) -> Array | None: ...
+        def __set__(self, instance: object, value: NestedArrayLike | None) -> None: ...
+
+else:
+    Numbers = Float[Array, "..."]
+    OptionalNumbers = Float[Array, "..."] | None
 
 
 def quantity(

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from physjax.backend import any_lane
 from physjax.checks import quantity
 from physjax.closures import warn_of_recompilation
+from physjax.cubics import Cubic
 from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
 from physjax.particles import append_axes, demand_particles
 from physjax.parts import as_module
@@ -68,7 +69,7 @@ def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> 
         )
     if not isinstance(surface, Distanced):
         warn_of_recompilation("crossing", [surface])
-        surface = as_module(surface) if callable(surface) else Height(jnp.asarray(surface), run.scene.up)
+        surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
@@ -250,11 +251,10 @@ def _find_candidate_intervals(replay: _Replay, way: Array) -> Bool[Array, "inter
     numbers = jnp.arange(len(replay.frames.state.position), dtype=jnp.int32)
     signed_distance, rate = jax.vmap(gap_and_rate)(numbers, replay.frames)
     d0, d1, r0, r1 = signed_distance[:-1], signed_distance[1:], rate[:-1], rate[1:]
-    b, a = 3 * (d1 - d0) - 2 * r0 - r1, r0 + r1 - 2 * (d1 - d0)
-    root = b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(b * b - 3 * a * r0, 0.0))
-    # the two places where it is level, by quotients that do not cancel; what is no number there is no place
-    level = [jnp.clip(jnp.nan_to_num(s, nan=1.0), 0.0, 1.0) for s in (-root / (3 * a), -r0 / root)]
-    middle = [d0 + s * (r0 + s * (b + s * a)) for s in (jnp.minimum(*level), jnp.maximum(*level))]
+    cubic = Cubic.through(d0, d1, r0, r1)
+    # an extremum that does not exist is moved to the end of the interval, where it divides nothing
+    level = [jnp.clip(jnp.nan_to_num(s, nan=1.0), 0.0, 1.0) for s in cubic.extrema()]
+    middle = [cubic.at(s) for s in (jnp.minimum(*level), jnp.maximum(*level))]
     ends = [d0, *middle, d1]
     pieces = [_crosses(before, after, way) for before, after in pairwise(ends)]
     return jnp.any(jnp.stack([_crosses(d0, d1, way), *pieces]), axis=0)

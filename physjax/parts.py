@@ -1,7 +1,7 @@
 """The parts of a scene: what a force and a contact can do, and how they are prepared when a scene is built."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from typing import ClassVar
 
@@ -197,6 +197,10 @@ class Contact(eqx.Module):
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """The state after contact; lanes that are not in contact stay as they are."""
 
+    def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray] | None:
+        """Polygons `(corners, 3)` [m] that show the surface in a box in space; None: they follow from the signed distance."""
+        return None
+
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
         """The contact with the memory of some lanes cleared, because other particles take their place."""
         return self
@@ -210,7 +214,7 @@ class Contact(eqx.Module):
         return self.signed_distance(t, state.position)
 
     def demand_fit(self, state: PyTree, mass: PyTree) -> None:
-        """Raise a TypeError for a state that cannot be in contact with it, a ValueError for lanes that start on the wrong side."""
+        """Raise a TypeError for a state of another kind, and a ValueError for lanes that start on the wrong side."""
         demand_particles("contacts", state, "rigid bodies need rigid.SurfaceContact(hull, plane)")
         demand_start_outside(self, state)
 

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
+from physjax.backend import block_fusion
 from physjax.checks import concrete_or_none, unchecked_quantity
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
@@ -56,7 +56,7 @@ class Pins(eqx.Module):
             self._replace_prescribed(velocity, state.velocity),
         )
         # materialised: XLA on CPU would evaluate the path again for every neighbour that reads a node
-        return state._replace(**lax.optimization_barrier({"position": position, "velocity": velocity}))
+        return state._replace(**block_fusion({"position": position, "velocity": velocity}))
 
     lead = prescribe
     """The name of the first edition."""

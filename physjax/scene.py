@@ -17,7 +17,7 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.backend import SINGLE_PIECE_NODES, materialise
+from physjax.backend import materialise, needs_split_compilation
 from physjax.loops import (
     RECORD,
     Time,
@@ -154,7 +154,7 @@ class Scene(eqx.Module):
     @property
     def compiles_in_pieces(self) -> bool:
         """Whether a step is compiled in pieces, as it is where more than a few nodes are coupled."""
-        return self.couples and self.state.lanes[-1:] > (SINGLE_PIECE_NODES,)
+        return needs_split_compilation(self.couples, self.state.lanes)
 
     def may_be_cut(self) -> bool:
         """Whether some lanes can be stepped without the rest: independent ones, and no part may hide an array of all lanes.

@@ -15,6 +15,8 @@ from typing import NamedTuple, TypeVar
 import jax
 import numpy as np
 
+from physjax.backend import read_work_clock
+
 Result = TypeVar("Result")
 
 
@@ -92,12 +94,12 @@ def time_in_turn(
 
 def _time_turn(run: Callable[[], object], slice_seconds: float) -> tuple[float, float]:
     """Mean wall-clock and processor seconds of a call; a call that fills the slice by itself is not repeated."""
-    busy = time.process_time()
+    busy = read_work_clock()
     warming = time_call(run)[1]
     if warming >= slice_seconds:
-        return warming, time.process_time() - busy
-    calls, started, busy = 0, time.perf_counter(), time.process_time()
+        return warming, read_work_clock() - busy
+    calls, started, busy = 0, time.perf_counter(), read_work_clock()
     while calls == 0 or time.perf_counter() - started < slice_seconds:
         jax.block_until_ready(run())
         calls += 1
-    return (time.perf_counter() - started) / calls, (time.process_time() - busy) / calls
+    return (time.perf_counter() - started) / calls, (read_work_clock() - busy) / calls

@@ -271,26 +271,14 @@ def _restore_run(cls: type, saved: dict[str, np.ndarray], scene: Scene | None, m
     if all(map(exact, floats)):
         arrays = {name: jnp.asarray(array) if ours else array for name, array in arrays.items()}
     recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
-    state = parts = final_scene = None
-    if scene is not None and ours:
-        final_state = _fill_tree("final_state", scene.state, arrays)
-        if final_state.position.shape != scene.state.position.shape:
-            raise ValueError(
-                f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
-                "Give the scene the run was made with."
-            )
-        final_parts = _fill_tree("final_parts", select_stateful_parts(scene), arrays, shaped=True)
-        _demand_same_contacts(select_stateful_parts(scene), final_parts)
-        final_scene = _replace_memories(scene, final_state, final_parts)
-        if not recorded:
-            parts = _fill_tree("parts", select_stateful_parts(scene), arrays, shaped=True)
-            _demand_same_contacts(select_stateful_parts(scene), parts)
+    final_scene, parts = (None, ()) if scene is None or not ours else _restore_end(scene, arrays, not recorded)
+    state = None
     if not recorded:
         state = _fill_tree("state", Particles(jnp.zeros(0), jnp.zeros(0)) if scene is None else scene.state, arrays)
     return cls(
         time=arrays["time"],
         state=state,
-        parts=parts or (),
+        parts=parts,
         recorded=recorded.get("", recorded) if recorded else None,
         ok=arrays["ok"],
         scene=scene,
@@ -301,6 +289,24 @@ def _restore_run(cls: type, saved: dict[str, np.ndarray], scene: Scene | None, m
         save_every=int(arrays["save_every"]),
         steps=int(arrays["steps"]),
     )
+
+
+def _restore_end(scene: Scene, arrays: dict[str, Array | np.ndarray], filmed: bool) -> tuple[Scene, tuple]:
+    """The scene at the end of the run, and the parts with memory over its frames, where these were `filmed`."""
+    final_state = _fill_tree("final_state", scene.state, arrays)
+    if final_state.position.shape != scene.state.position.shape:
+        raise ValueError(
+            f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
+            "Give the scene the run was made with."
+        )
+    stateful = select_stateful_parts(scene)
+    final_parts = _fill_tree("final_parts", stateful, arrays, shaped=True)
+    _demand_same_contacts(stateful, final_parts)
+    parts = ()
+    if filmed:
+        parts = _fill_tree("parts", stateful, arrays, shaped=True)
+        _demand_same_contacts(stateful, parts)
+    return _replace_memories(scene, final_state, final_parts), parts
 
 
 def _cast_to_run(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:

@@ -25,6 +25,13 @@ class Promises(NamedTuple):
     order_with_drag: int
 
 
+@runtime_checkable
+class PromisingMethod(Protocol):
+    """A method that says what it promises, as all of the library's do but those that subdivide a step."""
+
+    promises: Promises
+
+
 def promises(
     *, order: int, evaluations: int, stability_limit: float, order_with_drag: int | None = None
 ) -> Callable[[Callable], Callable]:

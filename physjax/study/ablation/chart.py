@@ -1,8 +1,14 @@
-"""An ablation drawn: what each part changes beside what counts and what is only numerical, and the time it takes."""
+"""An ablation drawn: what each part changes, next to what counts and what is only numerical, and the time it takes."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from physjax.study.ablation.ablate import Ablation
 
 VERDICT_COLOURS = {
     "needed": "#D55E00",
@@ -11,12 +17,14 @@ VERDICT_COLOURS = {
     "negligible": "#56B4E9",
     "none": "0.7",
 }
-"""By verdict."""
+"""Colour-blind safe; grey where there is nothing to see."""
 
 
-def draw_ablation(result: Any, figure: Any = None) -> Any:
+def draw_ablation(result: "Ablation", figure: "Figure | None" = None) -> "Figure":
     """A row for each part left out: the largest change of the outcome, its numerical error, and the time saved."""
     from matplotlib import pyplot as plt
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
     effects = result.effects
     timed = not np.isnan(result.whole.seconds)
@@ -34,15 +42,17 @@ def draw_ablation(result: Any, figure: Any = None) -> Any:
         panels[1].grid(axis="x", color="0.9")
         panels[1].set_axisbelow(True)
     shown = [verdict for verdict in VERDICT_COLOURS if verdict in {effect.verdict for effect in effects}]
-    handles = [plt.Rectangle((0, 0), 1, 1, color=VERDICT_COLOURS[verdict], label=verdict) for verdict in shown]
-    handles.append(plt.Line2D([], [], color="black", marker="|", linestyle="", markersize=11, label="numerical error"))
-    handles.append(plt.Line2D([], [], color="black", linestyle="--", label="what counts"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    handles = [Patch(color=VERDICT_COLOURS[verdict], label=verdict) for verdict in shown]
+    lines = [
+        Line2D([], [], color="black", marker="|", linestyle="", markersize=11, label="numerical error"),
+        Line2D([], [], color="black", linestyle="--", label="what counts"),
+    ]
+    figure.legend(handles=[*handles, *lines], loc="outside lower center", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
-def _draw_changes(ax: Any, result: Any, places: np.ndarray, colours: list[str]) -> None:
-    """Bars of the largest changes in units of what counts; what is zero, or no number, is written out."""
+def _draw_changes(ax: "Axes", result: "Ablation", places: np.ndarray, colours: list[str]) -> None:
+    """Bars of the largest changes in units of what counts; what is zero or not finite is written out."""
     relative = bool(np.all(result.threshold > 0))
     change, numerical, unit = np.array([result.worst_entry(effect) for effect in result.effects]).T
     change, numerical = (change / unit, numerical / unit) if relative else (change, numerical)

@@ -4,13 +4,13 @@ A few runs of each method from coarse to fine show its error and its cost; betwe
 that is asked for, which is then verified by a run. Only what can still win is verified, and only that is timed well.
 """
 
-import time
 from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
+from physjax.backend import read_work_clock
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.adaptive import adaptive
@@ -71,9 +71,10 @@ def recommend(
     with contacts, forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson:
     the answer says which. `methods`: the registry and adaptive rk4, unless given; those that promise no more than another
     in any respect are left out, adaptive ones also where contacts are resolved at the end of a step, implicit ones where
-    accuracy limits the step before stability does. `seconds` of processor time bound the search: what is not reached is
-    reported. Everything rarer is a field of `accuracy.SearchOptions`, accepted as a keyword as well: `gradient`, `scale`,
-    `dtypes`, `frames`, `progress`.
+    accuracy limits the step before stability does. `seconds` of processor time (of
+    wall-clock time where the work is not on a CPU) bound the search: what is not reached is reported. Everything rarer is
+    a field of `accuracy.SearchOptions`, accepted as a keyword as well: `gradient`, `scale`, `dtypes`, `frames`,
+    `progress`.
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
 
     Example:
@@ -86,7 +87,7 @@ def recommend(
     options = merge_options("recommend", options, more)
     problem, errors = _check_request(scene, error, horizon, options.frames)
     norm, dtypes = as_error_measure(norm), [np.dtype(dtype).name for dtype in options.dtypes]
-    deadline = time.process_time() + float(as_real_quantity("seconds [s]", seconds, above=0.0))
+    deadline = read_work_clock() + float(as_real_quantity("seconds [s]", seconds, above=0.0))
     shown = progress_bar(progress=options.progress, desc="recommend", unit="method", leave=False)
     with jax.enable_x64(True), shown as bar:
         bar.set_postfix_str("the true path")
@@ -154,10 +155,10 @@ def _explore_methods(
         if found and 2 * longest > task.time_left():
             untried.append(name)
             continue
-        started = time.process_time()
+        started = read_work_clock()
         entry = compile_run(task.problem, method, push=task.push)
         found.append(explore_method(task, entry, least, found, _guess_fineness(found, entry)))
-        longest = max(longest, time.process_time() - started)
+        longest = max(longest, read_work_clock() - started)
         bar.update()
     return found, tuple(untried)
 

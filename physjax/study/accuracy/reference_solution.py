@@ -5,7 +5,6 @@ so large that diffrax would take minutes, our own rk4 with far finer steps, whos
 error (Richardson).
 """
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -16,6 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
+from physjax.backend import read_work_clock
 from physjax.scene import Scene
 from physjax.stepping.methods import rk4
 from physjax.stepping.reference import build_default_solver, cast_floats, solve_ode
@@ -239,7 +239,7 @@ def _make_own_solver(
     fineness: list[int] = []  # of the first solution; the nudged one takes the same steps, so their errors cancel
 
     def solve(scene: Scene, alone: bool = False) -> tuple[PyTree, PyTree, PyTree, str]:
-        runs, count, started = [], FIRST_STEPS_PER_FRAME, time.process_time()
+        runs, count, started = [], FIRST_STEPS_PER_FRAME, read_work_clock()
         if alone:
             runs.append(_run_compiled(compiled, scene, fineness[0]))
             return runs[0][0], None, None, ""
@@ -247,8 +247,8 @@ def _make_own_solver(
             runs.append(_run_compiled(compiled, scene, count))
             if len(runs) >= 3 and _has_converged(problem, scene, runs, CONVERGED_ERROR_SHARE * wanted):
                 break
-            # the next run takes twice as long as the last, hence as long again as all so far together
-            if len(runs) >= 3 and 3 * (time.process_time() - started) > seconds:
+            # the next takes twice as long as the last
+            if len(runs) >= 3 and 3 * (read_work_clock() - started) > seconds:
                 break
             count = 2 * count + 1  # steps that never end where the coarser ones did
         fineness.append(count)

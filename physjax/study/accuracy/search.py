@@ -1,6 +1,5 @@
 """The search behind a recommendation: runs from coarse to fine, the step for an error between them, times in turn."""
 
-import time
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -10,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from physjax.backend import read_work_clock
 from physjax.particles import Particles
 from physjax.study.accuracy.compiled_run import CompiledRun
 from physjax.study.accuracy.error_measures import ErrorMeasure, path
@@ -39,7 +39,7 @@ MAX_REFINEMENTS = 6
 
 
 class SearchTask(NamedTuple):
-    """What is asked of a run, and the deadline (`time.process_time`) of the search."""
+    """What is asked of a run, and the deadline (by `read_work_clock`) of the search."""
 
     problem: Problem
     truth: ReferenceSolution
@@ -49,8 +49,8 @@ class SearchTask(NamedTuple):
     deadline: float
 
     def time_left(self) -> float:
-        """Processor time left [s]."""
-        return self.deadline - time.process_time()
+        """Time left [s]: of processor time on a CPU."""
+        return self.deadline - read_work_clock()
 
     def error(self, found: PyTree) -> float:
         """The error of a run; of the derivative along the push as well, if there is one."""

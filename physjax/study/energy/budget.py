@@ -1,22 +1,27 @@
 """The ledger of a run: what every store and every cause received of its energy, momentum and angular momentum."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from physjax.particles import callable_name
 from physjax.scene import Scene, project
-from physjax.study.energy.audit import NUMERICAL, RESPONSE_OBSERVERS, audit_run, list_causes
+from physjax.study.energy.audit import NUMERICAL, RESPONSE_OBSERVERS, EnergyBudget, audit_run, list_causes
 from physjax.text import format_table
 from physjax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 UNITS = {"energy": "J", "momentum": "kg m/s", "angular momentum": "kg m²/s"}
 FIRST_SUBSTEPS, MAX_SUBSTEPS = 2, 512
 """Steps of order 8 for one of the run, at first and at most."""
 SUBSTEP_TOLERANCE = 1e-11
-"""The exact motion is exact enough when twice the substeps change no entry by more than this part of the largest."""
+"""The exact motion is exact enough when twice the substeps change no entry by more than this share of the largest: some
+thousand roundings in float64, which the sums over a run come to."""
 
 
 class Account(NamedTuple):
@@ -25,8 +30,8 @@ class Account(NamedTuple):
     `received[name]` is `(frames, *status)` in `unit`, with the components last for vectors; `status` is per lane, or per
     scene where lanes are coupled. Stores are "kinetic" and "potential of ..." (of a momentum: "scene"); everything else
     is a cause: a force has received what it took by its work (if it has a potential, only what that does not account
-    for), a contact what an impact lost. A negative entry has given. All entries sum to zero, but for `gap`. `size` is the
-    quantity's own: kinetic energy, Σm|v|, Σm|r||v|.
+    for), a contact what an impact dissipated. A negative entry has given. All entries sum to zero, but for `gap`. `size`
+    is the quantity's own scale: kinetic energy, Σm|v|, Σm|r||v|.
     """
 
     unit: str
@@ -41,11 +46,17 @@ class Account(NamedTuple):
     @property
     def gap(self) -> np.ndarray:
         """The sum of all entries, which would be zero in exact arithmetic, frame by frame."""
-        return sum(self.received.values())
+        first, *others = self.received.values()
+        return sum(others, first)
+
+    @property
+    def closing(self) -> float:
+        """The old name of `closure_error`."""
+        return self.closure_error
 
     @property
     def closure_error(self) -> float:
-        """The largest gap in parts of the largest entry, or of the `size`: kinetic energy, Σm|v|, Σm|r||v|."""
+        """The largest gap relative to the largest entry, or to the `size`: kinetic energy, Σm|v|, Σm|r||v|."""
         largest = max([float(np.abs(series).max()) for series in self.received.values()] + [float(self.size.max())])
         return float(np.abs(self.gap).max()) / largest if largest else 0.0
 
@@ -53,8 +64,9 @@ class Account(NamedTuple):
 class Ledger(NamedTuple):
     """Where energy, momentum and angular momentum of a run went. Printed, it is a table of the totals over all lanes.
 
-    `time` [s] is of the frames. `angular_momentum`, about the origin, is None in one dimension. `substeps` of order 8
-    followed the exact motion through each step; `substep_error` is by how much fewer of them would change the largest entry.
+    `time` [s] is that of the frames. `angular_momentum`, about the origin, is None in one dimension. `substeps` of order
+    8 followed the exact motion through each step; `substep_error` is by how much half as many would change an entry,
+    relative to the largest.
     """
 
     time: np.ndarray
@@ -64,6 +76,11 @@ class Ledger(NamedTuple):
     angular_momentum: Account | None
     substeps: int
     substep_error: float
+
+    @property
+    def unsettled(self) -> float:
+        """The old name of `substep_error`."""
+        return self.substep_error
 
     @property
     def accounts(self) -> dict[str, Account]:
@@ -79,9 +96,9 @@ class Ledger(NamedTuple):
             columns.append([_format_total(account, totals.get(label)) for label in (*labels, "sum")])
         rows = [[label, *cells] for label, *cells in zip((*labels, "sum"), *columns, strict=True)]
         span = f"{float(np.max(self.time[-1] - self.time[0])):.6g} s of {self.method}"
-        return f"{span}; {NUMERICAL}: what the method made itself\n{format_table(headers, rows)}"
+        return f"{span}; {NUMERICAL}: the method's own error\n{format_table(headers, rows)}"
 
-    def plot(self, figure: Any = None) -> Any:
+    def plot(self, figure: "Figure | None" = None) -> "Figure":
         """Draw the energy over time and its totals; returns the matplotlib figure."""
         from physjax.study.energy.chart import draw_energy_budget
 
@@ -108,10 +125,18 @@ def build_ledger(run: Trajectory, scene: Scene | None = None) -> Ledger:
         raise TypeError(f"ledger: got a {type(run).__name__}, expected the Trajectory that simulate returns.")
     if scene is not None:
         run = eqx.tree_at(lambda run: run.scene, run, scene, is_leaf=lambda leaf: leaf is None)
+    scene = _demand_audited_scene(run)
+    with jax.enable_x64(True):
+        stock, received, substeps, substep_error = _refine_substeps(run)
+    return _build_accounts(run, scene, stock, received, substeps, substep_error)
+
+
+def _demand_audited_scene(run: Trajectory) -> Scene:
+    """The scene of a run that can be stepped again; a ValueError for one that cannot, or whose stages are not known."""
     if run.scene is None or run.stepper is None or run.state is None:
         raise ValueError(
             "ledger: got a run that does not know its scene, its method or its states. Give scene=, simulate without "
-            "record=, and load with method=; a reference has no method whose share could be told."
+            "record=, and load with method=; a reference has no method whose error could be measured."
         )
     if run.scene.emitter is not None:
         raise ValueError(
@@ -121,16 +146,14 @@ def build_ledger(run: Trajectory, scene: Scene | None = None) -> Ledger:
     for contact in run.scene.contacts:
         if (contact.response or project) not in (*RESPONSE_OBSERVERS, project):
             raise ValueError(
-                f"ledger: {type(contact).__name__} has a response of its own, expected one of physjax: what is done to a "
-                "touch must be known."
+                f"ledger: {type(contact).__name__} has a response of its own, expected one of physjax, whose stages are "
+                "known."
             )
-    with jax.enable_x64(True):
-        stock, brought, substeps, substep_error = _refine_substeps(run)
-    return _build_accounts(run, stock, brought, substeps, substep_error)
+    return run.scene
 
 
-def _refine_substeps(run: Trajectory) -> tuple[Any, Any, int, float]:
-    """The books with as many substeps as change them no more."""
+def _refine_substeps(run: Trajectory) -> tuple[EnergyBudget, EnergyBudget, int, float]:
+    """The stock and the budget with substeps doubled until the entries no longer change."""
     substeps = FIRST_SUBSTEPS
     stock, before = _audit_with_substeps(run, substeps)
     while True:
@@ -142,12 +165,12 @@ def _refine_substeps(run: Trajectory) -> tuple[Any, Any, int, float]:
         before = brought
 
 
-def _audit_with_substeps(run: Trajectory, substeps: int) -> tuple[Any, Any]:
+def _audit_with_substeps(run: Trajectory, substeps: int) -> tuple[EnergyBudget, EnergyBudget]:
     return jax.tree.map(np.asarray, audit_run(run, jnp.asarray(substeps)))
 
 
-def _largest_change(before: Any, brought: Any, stock: Any, name: str) -> float:
-    """The largest change of an entry, in parts of the largest that the quantity has."""
+def _largest_change(before: EnergyBudget, brought: EnergyBudget, stock: EnergyBudget, name: str) -> float:
+    """The largest change of an entry relative to the largest that the quantity has."""
     largest = np.abs(stock["amounts"][name] - stock["amounts"][name][:1]).max()
     sums = lambda budget, cause: np.cumsum(budget[cause][name], axis=0)  # noqa: E731
     largest = max([largest, stock["sizes"][name].max()] + [np.abs(sums(brought, cause)).max() for cause in brought])
@@ -155,7 +178,9 @@ def _largest_change(before: Any, brought: Any, stock: Any, name: str) -> float:
     return float(change / largest) if largest else 0.0
 
 
-def _build_accounts(run: Trajectory, stock: Any, brought: Any, substeps: int, substep_error: float) -> Ledger:
+def _build_accounts(
+    run: Trajectory, scene: Scene, stock: EnergyBudget, brought: EnergyBudget, substeps: int, substep_error: float
+) -> Ledger:
     """The accounts, summed up frame by frame; a run that came out of vmap has its axis behind that of the frames."""
     batched = run.first_step.ndim
     frames_first = lambda series: np.moveaxis(series, batched, 0) if batched else series  # noqa: E731
@@ -165,7 +190,7 @@ def _build_accounts(run: Trajectory, stock: Any, brought: Any, substeps: int, su
     for name, amount in stock["amounts"].items():
         stores = stock["stored"] if name == "energy" else {"scene": amount}
         received = {store: gained(series) for store, series in stores.items()}
-        for cause in (label for labels in list_causes(run.scene) for label in labels):
+        for cause in (label for labels in list_causes(scene) for label in labels):
             total = np.cumsum(brought[cause][name], axis=0)
             received[cause] = -np.concatenate([np.zeros_like(total[:1]), total])
         silent = {cause for cause in received if name == "energy" and f"potential of {cause}" in received}
@@ -176,7 +201,7 @@ def _build_accounts(run: Trajectory, stock: Any, brought: Any, substeps: int, su
         accounts[name] = Account(UNITS[name], received, stock["sizes"][name])
     return Ledger(
         np.asarray(frames_first(np.asarray(run.time, float))),
-        getattr(run.method, "__name__", type(run.method).__name__),
+        callable_name(run.method),
         accounts["energy"],
         accounts["momentum"],
         accounts.get("angular momentum"),

@@ -1,4 +1,4 @@
-"""Which launch hits the target: both arcs, or the least speed, with any forces, in the plane or in space, through bounces.
+"""The launch that hits a target: both arcs, or the least speed, with any forces, in the plane or in space, by bounces.
 
 ```python
 shot = Scene(Particles(start, jnp.zeros(2)), mass=0.145, forces=(forces.Gravity(), forces.QuadraticDrag(4.3e-3, 0.35)))
@@ -9,16 +9,18 @@ aimed.low.angle, aimed.high.angle, aimed.low.time, aimed.ok
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none, demand_all
+from physjax.cubics import Cubic
+from physjax.linear import solve_columns
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
 from physjax.physics.contacts.time_of_impact import impact
@@ -28,16 +30,24 @@ from physjax.study.inverse.ricochet import find_ricochet
 from physjax.study.inverse.shooting import (
     AimProblem,
     Launch,
+    State,
     find_launch,
     find_nearest_launch,
     guess_launch,
     select_where,
 )
 from physjax.trajectory import Trajectory
-from physjax.vectors import dot, norm
+from physjax.vectors import components, dot, norm, stack_components
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FLIGHT_STEPS = 200
-"""Steps of a flight unless told otherwise."""
+"""Default number of steps of a flight."""
+MAX_SPEED_ERROR_SHARE = 0.1
+"""A speed is met if the launch is faster by no more than what moves the shot by this share of its rounding."""
+LEAST_SPEED_SHARE = 0.5
+"""A launch slower than this share of the speed asked for is a search that ran away."""
 
 
 class Shot(NamedTuple):
@@ -66,9 +76,9 @@ class Shot(NamedTuple):
 
 
 class Aimed(eqx.Module):
-    """The shots at each target: `low`, which is there first, and `high`.
+    """The shots at each target: `low`, which arrives first, and `high`.
 
-    Both are one at the least speed, out of reach, and where there is only one, as in a straight line without forces.
+    They are the same at the least speed, out of reach, and where there is only one, as in a straight line without forces.
     """
 
     low: Shot
@@ -93,8 +103,8 @@ class Aimed(eqx.Module):
         """The whole flight of a shot, every step a frame; it ends at the target."""
         return self.shots.flight(Launch(shot.velocity, shot.time), save_every=1)
 
-    def plot(self, *, every: int = 1, ax: Any = None) -> Any:
-        """Draw both arcs to one target in so many, and the targets; returns the axes."""
+    def plot(self, *, every: int = 1, ax: "Axes | None" = None) -> "Axes":
+        """Draw both arcs to one target in `every`, and the targets; returns the axes."""
         from physjax.study.inverse.chart import draw_shots
 
         return draw_shots(self, every=every, ax=ax)
@@ -107,13 +117,13 @@ def aim_at(
     *,
     speed: ArrayLike | None = None,
     bounces: int = 0,
-    method: Callable = rk4,
+    method: Callable[..., PyTree] = rk4,
     steps: int = FLIGHT_STEPS,
 ) -> Aimed:
     """The launches from where the scene's lanes are that hit a target `(*lanes, dim)` [m] at a speed [m/s].
 
-    The direction of launch is free; of the state's velocity nothing is used. Without `speed` the least speed that hits
-    is found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
+    The direction of launch is free; the state's velocity is not used. Without `speed` the least speed that hits is
+    found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
     angle and flight time are solved for together, to the last digits, so that the error left is the method's own.
     Contacts are obstacles, unless the target is to be hit after `bounces` impacts on them (`contacts.impact`). Then a
     fan of directions is tried: `low` is the soonest hit that it leads to, `high` the latest. A target out of reach gives
@@ -150,8 +160,8 @@ def _solve_both_arcs(shots: AimProblem, speed: Array | None, bounces: int) -> tu
 
 
 def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounces: int) -> Shot:
-    """One arc. Without bounces it is searched in free flight; what is in the way shows when it is flown."""
-    if bounces:
+    """One arc. Without bounces it is searched in free flight; then it is flown with the contacts in its way."""
+    if bounces and speed is not None and late is not None:
         launch, legal = _differentiate_implicitly(shots, speed, lambda: find_ricochet(shots, speed, late, bounces))
     else:
         free = AimProblem(shots.scene.replace(contacts=()), shots.target, shots.method, shots.steps)
@@ -159,7 +169,7 @@ def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounc
     up = shots.scene.up
     across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
     flight = shots.flight(launch, save_every=1, record=_HEIGHT_RECORDERS[up])
-    residual = flight.final_scene.state.position - shots.target
+    residual = _demand_end(flight) - shots.target
     ok = legal & (norm(residual) <= shots.rounding(launch))
     velocity, time = launch = _stop_gradient_unless(ok, launch)
     level = [velocity[..., axis] for axis in across]
@@ -176,20 +186,28 @@ def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounc
     )
 
 
+def _demand_end(flight: Trajectory) -> Array:
+    """Where a flight that `simulate` returned ends [m]."""
+    assert flight.final_scene is not None
+    return flight.final_scene.state.position
+
+
 def _search_free_flight(shots: AimProblem, speed: Array | None, late: Array | None) -> tuple[Launch, Array]:
-    """The launch that hits or, at a given speed, comes nearest; of those any will do."""
+    """The launch that hits or, at a given speed, comes nearest; and whether it is legal, as every nearest one is."""
     launch, found = find_launch(shots, speed, late)
     if speed is None:
         return launch, found
     # without a force to bring it back there is no high arc, and the search for it runs away
-    launch = select_where(norm(launch.velocity) > 0.5 * speed, launch, guess_launch(shots, speed))
-    too_fast = (norm(launch.velocity) - speed) * launch.time > 0.1 * shots.rounding(launch)
+    launch = select_where(norm(launch.velocity) > LEAST_SPEED_SHARE * speed, launch, guess_launch(shots, speed))
+    too_fast = (norm(launch.velocity) - speed) * launch.time > MAX_SPEED_ERROR_SHARE * shots.rounding(launch)
     launch, _ = find_nearest_launch(shots, launch, speed, too_fast | ~found)
     return launch, jnp.ones_like(found)
 
 
-def _differentiate_implicitly(shots: AimProblem, speed: Array | None, search: Callable) -> tuple[Launch, Array]:
-    """What the search finds, the launch with the derivatives of the implicit function theorem: it is a root of `conditions`."""
+def _differentiate_implicitly(
+    shots: AimProblem, speed: Array | None, search: Callable[[], tuple[Launch, Array]]
+) -> tuple[Launch, Array]:
+    """What the search finds, with the derivatives of the implicit function theorem: the launch is a root of `conditions`."""
 
     def conditions(packed):
         launch = Launch(packed[..., :-1], packed[..., -1])
@@ -211,27 +229,28 @@ def _differentiate_implicitly(shots: AimProblem, speed: Array | None, search: Ca
     return Launch(packed[..., :-1], packed[..., -1]), legal > 0
 
 
-def _solve_by_lane(linear: Callable, b: Array) -> Array:
+def _solve_by_lane(linear: Callable[[Array], Array], b: Array) -> Array:
     """The solution of linear(x) = b, a small system for each lane; zero where that is singular."""
     size = b.shape[-1]
     rows = jnp.eye(size, dtype=b.dtype)
     columns = jax.vmap(linear)(
         jnp.broadcast_to(rows.reshape((size,) + (1,) * (b.ndim - 1) + (size,)), (size, *b.shape))
     )
-    matrix = jnp.moveaxis(columns, 0, -1)
-    probe = jnp.linalg.solve(lax.stop_gradient(matrix), jnp.ones((*b.shape, 1), b.dtype))
-    sound = jnp.all(jnp.isfinite(probe), axis=(-2, -1))
-    matrix = jnp.where(sound[..., None, None], matrix, rows)
-    return jnp.where(sound[..., None], jnp.linalg.solve(matrix, b[..., None])[..., 0], 0.0)
+    matrix, right = [components(column) for column in columns], components(b)
+    probe = solve_columns(lax.stop_gradient(matrix), [jnp.ones_like(part) for part in right])
+    sound = jnp.all(jnp.isfinite(jnp.stack(probe)), axis=0)
+    # the identity stands in for a singular matrix: a choice after the solve would leave NaN in its derivative
+    matrix = [[jnp.where(sound, part, rows[i, j]) for j, part in enumerate(column)] for i, column in enumerate(matrix)]
+    return stack_components([jnp.where(sound, part, 0.0) for part in solve_columns(matrix, right)])
 
 
-def _record_height(t: Array, state: Any, *, up: int) -> tuple[Array, Array]:
+def _record_height(t: Array, state: Particles, *, up: int) -> tuple[Array, Array]:
     """Height [m] and rate of climb [m/s]."""
     return state.position[..., up], state.velocity[..., up]
 
 
 _HEIGHT_RECORDERS = [partial(_record_height, up=axis) for axis in range(3)]
-"""What is recorded of a flight, by the axis that is up; named once, since a new function would compile anew."""
+"""What is recorded of a flight, by the axis that is up; made once, since every new function recompiles."""
 
 
 def _apex_height(recorded: tuple[Array, Array], dt: Array) -> Array:
@@ -240,21 +259,16 @@ def _apex_height(recorded: tuple[Array, Array], dt: Array) -> Array:
     (y0, y1), (v0, v1) = ((a[:-1], a[1:]) for a in (height, climb))
     turns = (v0 > 0) & (v1 < 0)
     share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.0)
-    rest = 1 - share
-    top = (
-        rest**2 * (1 + 2 * share) * y0
-        + share**2 * (1 + 2 * rest) * y1
-        + share * rest * dt[None] * (rest * v0 - share * v1)
-    )
+    top = Cubic.through(y0, y1, dt[None] * v0, dt[None] * v1).at(share)
     return jnp.maximum(jnp.max(top, axis=0), height[-1])
 
 
-def _stop_gradient_unless(ok: Array, values: Any) -> Any:
-    """The values, which do not move with anything where a lane is not ok."""
+def _stop_gradient_unless(ok: Array, values: State) -> State:
+    """The values, without derivatives in lanes that are not ok."""
     return select_where(ok, values, lax.stop_gradient(values))
 
 
-def _check_bounces(bounces: int, speed: Any, scene: Scene) -> int:
+def _check_bounces(bounces: int, speed: ArrayLike | None, scene: Scene) -> int:
     bounces = as_positive_integer("bounces", bounces, at_least=0)
     if bounces and speed is None:
         raise ValueError(
@@ -268,7 +282,7 @@ def _check_bounces(bounces: int, speed: Any, scene: Scene) -> int:
     return bounces
 
 
-def _check_problem(scene: Scene, target: ArrayLike, method: Callable, steps: int) -> AimProblem:
+def _check_problem(scene: Scene, target: ArrayLike, method: Callable[..., PyTree], steps: int) -> AimProblem:
     """Scene and targets with the same lanes, checked."""
     if not isinstance(scene, Scene):
         raise TypeError(f"aim_at: got a {type(scene).__name__}, expected a Scene whose position is where it is fired.")
@@ -301,9 +315,9 @@ def _check_problem(scene: Scene, target: ArrayLike, method: Callable, steps: int
     shape = (lanes or here) + position.shape[-1:]
     position, target = jnp.broadcast_to(position, shape), jnp.broadcast_to(target, shape)
     away = norm(target - position)
-    if concrete_or_none(away) is not None:
-        demand_all(
-            "distance from launch to target [m]", away, concrete_or_none(away) > 0, "a target away from the launch"
-        )
+    known_away = concrete_or_none(away)
+    if known_away is not None:
+        demand_all("distance from launch to target [m]", away, known_away > 0, "a target away from the launch")
     at_rest = Particles(position, jnp.zeros_like(position))
-    return AimProblem(scene.replace(state=at_rest), target, as_module(method), steps)
+    stepper = as_module(method)
+    return AimProblem(scene.replace(state=at_rest), target, stepper, steps)  # pyright: ignore[reportArgumentType]  # it is callable

@@ -1,41 +1,36 @@
 """Aimed shots drawn: both arcs, where they are fired, the targets, and by how much they miss."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from physjax.show import obstacles
 from physjax.show.stage import Stage, create_axes
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from physjax.study.inverse.aim import Aimed, Shot
+
 LOW_COLOUR, HIGH_COLOUR = "#0072B2", "#D55E00"
-"""Colours of the arcs, told apart by the colour-blind too."""
+"""Colours of the arcs, colour-blind safe."""
 FIGURE_WIDTH_INCHES = 7.2
-"""Of a figure of its own [inches]."""
+"""Width of a figure of its own [inches]: a page of text."""
 
 
-def draw_shots(aimed: Any, *, every: int = 1, ax: Any = None) -> Any:
-    """Draw the shots of an `Aimed` at one target in so many: arcs that hit are solid, misses dashed; returns the axes."""
-    from matplotlib import pyplot as plt
-
+def draw_shots(aimed: "Aimed", *, every: int = 1, ax: "Axes | None" = None) -> "Axes":
+    """Draw the shots of an `Aimed` at one target in `every`: arcs that hit are solid, misses dashed; returns the axes."""
     one = np.array_equal(aimed.low.time, aimed.high.time, equal_nan=True)
     arcs = {"both arcs": aimed.low} if one else {"low arc": aimed.low, "high arc": aimed.high}
     paths = {name: _flatten_lanes(aimed.flight(shot).position, 1)[:, ::every] for name, shot in arcs.items()}
     target = _flatten_lanes(aimed.target)[::every]
     points = np.concatenate([*(path.reshape(-1, target.shape[-1]) for path in paths.values()), target])
     points = points[np.isfinite(points).all(axis=-1)]
-    contacts = obstacles.select_shared_surfaces(aimed.shots.scene.contacts)
+    contacts = obstacles.select_shared_surfaces(aimed.shots.scene.contacts, points.shape[-1])
     stage = obstacles.include_obstacles(Stage(points.min(axis=0), points.max(axis=0)), contacts).expand(0.05)
     own, above = ax is None, aimed.shots.scene.up
-    if own:
-        across, up = (stage.high - stage.low)[:2]
-        height = (
-            0.8 * FIGURE_WIDTH_INCHES
-            if target.shape[-1] == 3
-            else float(np.clip(0.9 * FIGURE_WIDTH_INCHES * up / across, 2.2, FIGURE_WIDTH_INCHES)) + 1.2
-        )
-        ax = create_axes(
-            plt.figure(figsize=(FIGURE_WIDTH_INCHES, height), layout="constrained"), (1, 1, 1), stage, above
-        )
+    ax = _create_shot_axes(stage, above) if ax is None else ax
     if target.shape[-1] == 2:
         obstacles.draw_flat(ax, stage, contacts, 0.0)
     else:
@@ -52,15 +47,28 @@ def draw_shots(aimed: Any, *, every: int = 1, ax: Any = None) -> Any:
     return ax
 
 
-def _draw_arc(ax: Any, path: np.ndarray, ok: np.ndarray, colour: str, label: str) -> None:
+def _create_shot_axes(stage: Stage, up: int) -> "Axes":
+    """Axes of a figure that is as high as the stage asks for."""
+    from matplotlib import pyplot as plt
+
+    wide, high = (stage.high - stage.low)[:2]
+    if len(stage.low) == 3:
+        height = 0.8 * FIGURE_WIDTH_INCHES
+    else:
+        height = float(np.clip(0.9 * FIGURE_WIDTH_INCHES * high / wide, 2.2, FIGURE_WIDTH_INCHES)) + 1.2
+    figure = plt.figure(figsize=(FIGURE_WIDTH_INCHES, height), layout="constrained")
+    return create_axes(figure, (1, 1, 1), stage, up)
+
+
+def _draw_arc(ax: "Axes", path: np.ndarray, ok: np.ndarray, colour: str, label: str) -> None:
     """The paths of an arc `(frames, lanes, dim)`, one entry in the legend for all."""
     for lane in range(path.shape[1]):
         line = "-" if ok[lane] else "--"
         ax.plot(*path[:, lane].T, line, color=colour, linewidth=1.6, label=label if lane == 0 else None)
 
 
-def _describe_arc(name: str, shot: Any) -> str:
-    """What the legend says of an arc; with numbers where it is one."""
+def _describe_arc(name: str, shot: "Shot") -> str:
+    """An arc in the legend, with numbers where it is a single shot."""
     if np.ndim(shot.time):
         return name if np.all(shot.ok) else f"{name} (dashed: nearest miss)"
     words = f"{name}: {np.degrees(shot.angle):.2f}°"
@@ -70,7 +78,7 @@ def _describe_arc(name: str, shot: Any) -> str:
     return words if shot.ok else f"{words}, misses by {float(shot.miss):.3g} m"
 
 
-def _flatten_lanes(array: Any, leading: int = 0) -> np.ndarray:
-    """All lanes on one axis, behind so many leading ones."""
+def _flatten_lanes(array: ArrayLike, leading: int = 0) -> np.ndarray:
+    """All lanes on one axis, behind the given number of leading ones."""
     array = np.asarray(array, float)
     return array.reshape(*array.shape[:leading], -1, array.shape[-1])

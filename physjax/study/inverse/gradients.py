@@ -1,7 +1,7 @@
-"""How far the gradient of a run can be trusted: how its sensitivity to the start grows, and whether `jax.grad` has it right."""
+"""How long the gradient of a run can be trusted: how its sensitivity to the start grows, and whether `jax.grad` is right."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,12 +14,18 @@ from physjax.checks import as_real_quantity, demand_known
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.simulate import simulate
+from physjax.trajectory import Trajectory
 from physjax.vectors import dot, norm
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 MISMATCH_ROUNDING_FACTOR = 100.0
-"""Times the share to which rounding grows along a path: so far apart may the two modes be."""
+"""The two modes may differ by this many times the share to which rounding grows along a path."""
 MAX_PROBES = 32
-"""Directions looked at: all there are, if they are no more; else random ones, whose mean square is right to a quarter."""
+"""Directions of deviation: all of them up to this number; else random ones, whose mean square is right to a quarter."""
+STILL_ROUNDINGS = 64
+"""Roundings of the largest place within which a path counts as one that never leaves its start."""
 
 
 class GradientHealth(eqx.Module):
@@ -28,14 +34,14 @@ class GradientHealth(eqx.Module):
     `sensitivity` is its root mean square growth over all directions, |∂x(t)/∂x(0)|/√n: [m per m], or [m per m/s] if the
     deviation is `of` the velocity. It grows as e^(rate t) where it is `exponential`, else as t^power; the other number is
     then 0. `limit` is the sensitivity at which the error of the start has become the given fraction of the path, `horizon`
-    [s] the time at which it does: beyond it a gradient says nothing about the true path. A horizon beyond the run goes on
-    with the law found. `mismatch` is how far `jax.grad` is from forward mode, as a share of the derivative, infinite where
-    it is not a number (None where it was not asked for): where that is more than rounding, it is not `ok`, and its horizon
-    is 0.
+    [s] the time at which it does: beyond it a gradient says nothing about the true path. A horizon beyond the run is
+    extrapolated by the law found. `mismatch` is how far `jax.grad` is from forward mode, relative to the derivative,
+    infinite where it is not finite (None where it was not measured): where that is more than rounding, the gradient is not
+    `ok`, and its horizon is 0.
 
     Example:
-        >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
-        >>> isinstance(told, gradients.GradientHealth), bool(told.exponential)
+        >>> found = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
+        >>> isinstance(found, gradients.GradientHealth), bool(found.exponential)
         (True, False)
     """
 
@@ -51,7 +57,7 @@ class GradientHealth(eqx.Module):
     fraction: Float[Array, ""]
     of: str = eqx.field(static=True)
 
-    def plot(self, ax: Any = None) -> Any:
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
         """Draw the sensitivity over time, its limit and the horizon; returns the axes."""
         from physjax.study.inverse.gradient_chart import draw_gradient_health
 
@@ -72,21 +78,21 @@ def health(
     fraction: ArrayLike = 0.1,
     reverse: bool | None = None,
 ) -> GradientHealth:
-    """How the sensitivity of a run to its start grows with its length, and up to when its gradient can be trusted.
+    """How the sensitivity of a run to its start grows with its length, and until when its gradient can be trusted.
 
     Forward mode carries deviations of the start, `of` its "position" or its "velocity", along the frames of
     `simulate(scene, method, dt=..., steps=..., save_every=...)`: every direction where there are up to 32, as many random
-    ones where there are more. `error` [m] or [m/s] is how wrong the start is: rounding, if not given, ε times the largest
-    position (velocity); for that of the method give what it errs in a characteristic time. The horizon is where error
-    times sensitivity reaches the `fraction` of `size` [m]: of how far the path goes, as the frames tell, if not given.
-    Reverse mode is held against it along one random mixture of the frames; with `reverse=False` it is not, nor, if not
-    given, where it cannot be: under `methods.adaptive` without `tries`, where `jax.grad` raises. Under vmap and jit as
-    well. Raises ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up has an infinite
-    sensitivity from there on.
+    ones where there are more. `error` [m] or [m/s] is the error of the start: rounding by default, ε times the largest
+    position (velocity); for that of the method give its error over a characteristic time. The horizon is where error
+    times sensitivity reaches the `fraction` of `size` [m], by default of the extent of the path at its frames. Reverse
+    mode is compared with it along one random mixture of the frames, unless `reverse=False`; nor by default where it does
+    not exist: under `methods.adaptive` without `tries`, where `jax.grad` raises. Works under vmap and jit. Raises
+    ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up has an infinite sensitivity from there
+    on.
 
     Example:
-        >>> told = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
-        >>> round(float(told.power), 3), round(float(told.sensitivity[-1]), 3)
+        >>> found = gradients.health(shot, methods.verlet, dt=0.1, steps=20, of="velocity")
+        >>> round(float(found.power), 3), round(float(found.sensitivity[-1]), 3)
         (1.0, 2.0)
     """
     demand_known("kind of deviation", of, ("position", "velocity"))
@@ -95,67 +101,93 @@ def health(
         error = as_real_quantity(f"error [{'m' if of == 'position' else 'm/s'}]", error, above=0.0)
     if size is not None:
         size = as_real_quantity("size [m]", size, above=0.0)
-    ways = _choose_directions(scene)
+    start = scene.state.position if of == "position" else scene.state.velocity
 
-    def frames(leaf):
-        state = scene.state._replace(**{of: leaf})
-        run = simulate(scene.replace(state=state), method, dt=dt, steps=steps, duration=duration, save_every=save_every)
-        return run.position, run
+    def positions(leaf: Array) -> tuple[Array, Trajectory]:
+        moved = scene.replace(state=scene.state._replace(**{of: leaf}))
+        run = simulate(moved, method, dt=dt, steps=steps, duration=duration, save_every=save_every)
+        return jnp.asarray(run.position), run
 
-    start = getattr(scene.state, of)
-    push = lambda way: jax.jvp(frames, (start,), (jnp.broadcast_to(way, start.shape),), has_aux=True)  # noqa: E731
-    position, moves, run = jax.vmap(push, out_axes=(None, 0, None))(ways)
-    square = jnp.mean(dot(moves, moves), axis=0)
-    sensitivity = jnp.sqrt(jnp.sum(square, axis=-1) if scene.couples else square)
-    if error is None:
-        typical = _find_largest(scene, norm(getattr(run, of)))
-        error = float(jnp.finfo(start.dtype).eps) * jnp.where(typical > 0, typical, 1.0)
-    if size is None:
-        way, place = (_find_largest(scene, norm(x)) for x in (position - position[:1], position))
-        # frames at which it is always back at its start tell of no way, but for rounding
-        size = jnp.where(way > 64 * float(jnp.finfo(start.dtype).eps) * place, way, place)
-    limit = jnp.broadcast_to(fraction.astype(start.dtype) * size / error, scene.status_shape)
-    time = run.time.reshape(run.time.shape + (1,) * (sensitivity.ndim - run.time.ndim))
+    spread = _push_deviations(scene, positions, start)
+    run, sensitivity = spread.run, spread.sensitivity
+    limit = _find_limit(scene, run, of, error, size, fraction)
+    moments = jnp.asarray(run.time)
+    time = moments.reshape(moments.shape + (1,) * (sensitivity.ndim - moments.ndim))
     law = _fit_growth_law(time, sensitivity)
     horizon = _find_horizon(time, sensitivity, limit, *law)
     mismatch, ok = None, jnp.ones(horizon.shape, bool)
     if reverse or (reverse is None and not (isinstance(method, Adaptive) and method.tries is None)):
-        pull = jax.vjp(lambda leaf: frames(leaf)[0], start)[1]
-        mismatch, whole = _measure_mismatch(
-            scene, moves, jnp.broadcast_to(ways, (len(ways), *start.shape)), pull, sensitivity
-        )
+        pull = jax.vjp(lambda leaf: positions(leaf)[0], start)[1]
+        mismatch, whole = _measure_mismatch(scene, spread, pull)
         # where paths from rounded starts go apart, so do the two programs
         allowed = (
             float(jnp.finfo(start.dtype).eps) ** 0.5 + MISMATCH_ROUNDING_FACTOR * jnp.max(sensitivity, axis=0) / limit
         )
         ok = jnp.isfinite(mismatch) & (mismatch <= allowed)
         horizon = jnp.where(ok | ~whole, horizon, 0.0)
-    return GradientHealth(run.time, sensitivity, *law, limit, horizon, mismatch, ok, fraction, of)
+    return GradientHealth(moments, sensitivity, *law, limit, horizon, mismatch, ok, fraction, of)
+
+
+class _Spread(NamedTuple):
+    """A run, the directions in which its start deviates, how its frames move with each, and the root mean square of that."""
+
+    run: Trajectory
+    directions: Float[Array, "ways *lanes dim"]
+    moves: Float[Array, "ways frames *lanes dim"]
+    sensitivity: Float[Array, "frames *units"]
+
+
+def _push_deviations(scene: Scene, positions: Callable[[Array], tuple[Array, Trajectory]], start: Array) -> _Spread:
+    """The run with deviations of its start carried along it in forward mode."""
+    directions = _choose_directions(scene)
+    push = lambda way: jax.jvp(positions, (start,), (jnp.broadcast_to(way, start.shape),), has_aux=True)  # noqa: E731
+    _, moves, run = jax.vmap(push, out_axes=(None, 0, None))(directions)
+    square = jnp.mean(dot(moves, moves), axis=0)
+    sensitivity = jnp.sqrt(jnp.sum(square, axis=-1) if scene.couples else square)
+    return _Spread(run, jnp.broadcast_to(directions, (len(directions), *start.shape)), moves, sensitivity)
+
+
+def _find_limit(
+    scene: Scene, run: Trajectory, of: str, error: Array | None, size: Array | None, fraction: Array
+) -> Float[Array, "*units"]:
+    """The sensitivity at which the error of the start has become the fraction of the size of the path."""
+    position = jnp.asarray(run.position)
+    eps = float(jnp.finfo(position.dtype).eps)
+    if error is None:
+        typical = _find_largest(scene, norm(position if of == "position" else jnp.asarray(run.velocity)))
+        error = eps * jnp.where(typical > 0, typical, 1.0)
+    if size is None:
+        extent, place = (_find_largest(scene, norm(x)) for x in (position - position[:1], position))
+        # frames at which it is always back at its start show no extent, but for rounding
+        size = jnp.where(extent > STILL_ROUNDINGS * eps * place, extent, place)
+    return jnp.broadcast_to(fraction.astype(position.dtype) * size / error, scene.status_shape)
 
 
 def _measure_mismatch(
-    scene: Scene, moves: Array, ways: Array, pull: Callable, sensitivity: Array
-) -> tuple[Array, Array]:
+    scene: Scene, spread: _Spread, pull: Callable[[Array], tuple[Array]]
+) -> tuple[Float[Array, "*units"], Bool[Array, "*units"]]:
     """How far reverse mode is from forward mode, as a share; and for which units forward mode is finite.
 
-    Both give the derivative of one random mixture of all frames' positions along every way that was looked at.
+    Both give the derivative of one random mixture of all frames' positions along every direction that was pushed.
     """
+    moves, sensitivity = spread.moves, spread.sensitivity
     shape = sensitivity.shape + (1,) * (moves.ndim - 1 - sensitivity.ndim)
     whole = jnp.all(jnp.isfinite(sensitivity), axis=0)
     known = whole[None] & (sensitivity > 0)
+    # frames weigh alike: the last ones would drown the first in a run whose sensitivity grows exponentially
     weight = jnp.where(known, 1.0 / jnp.where(known, sensitivity, 1.0), 0.0).reshape(shape)
     mixture = weight * jax.random.normal(jax.random.key(1), moves.shape[1:], moves.dtype)
     (gradient,) = pull(mixture)
     over_nodes = lambda number: jnp.sum(number, axis=-1) if scene.couples else number  # noqa: E731
     forward = over_nodes(jnp.sum(dot(jnp.broadcast_to(mixture, moves.shape), moves), axis=1))
-    backward = over_nodes(dot(jnp.broadcast_to(gradient, ways.shape), ways))
+    backward = over_nodes(dot(jnp.broadcast_to(gradient, spread.directions.shape), spread.directions))
     size = jnp.sqrt(jnp.mean(forward**2, axis=0))
     apart = jnp.sqrt(jnp.mean((backward - forward) ** 2, axis=0)) / jnp.where(size > 0, size, 1.0)
     return jnp.where(jnp.isfinite(apart), apart, jnp.inf), whole
 
 
 def _choose_directions(scene: Scene) -> Array:
-    """Directions of the start's deviation, `(ways, *lanes, dim)` but for lanes that are independent, of length 1 on average."""
+    """Directions of the start's deviation, of length 1 on average: `(ways, *lanes, dim)`, with 1 for independent lanes."""
     shape = scene.state.position.shape[-1 - scene.couples :]
     count = shape[0] * shape[-1] if scene.couples else shape[-1]
     if count <= MAX_PROBES:
@@ -165,12 +197,12 @@ def _choose_directions(scene: Scene) -> Array:
 
 
 def _leading_shape(scene: Scene) -> tuple[int, ...]:
-    """An axis of length 1 for each axis of lanes, or of scenes, that move alike."""
+    """An axis of length 1 for each axis of independent lanes or scenes: all deviate alike."""
     return (1,) * len(scene.status_shape)
 
 
 def _find_largest(scene: Scene, length: Array) -> Array:
-    """The largest of the lengths over the frames, as long as they are finite, and over the nodes where they are coupled."""
+    """The largest finite length over the frames, and over the nodes where they are coupled."""
     largest = jnp.max(jnp.where(jnp.isfinite(length), length, 0.0), axis=0)
     return jnp.max(largest, axis=-1) if scene.couples else largest
 
@@ -188,12 +220,12 @@ def _fit_growth_law(time: Array, sensitivity: Array) -> tuple[Array, Array, Arra
     """
     grown = _log_peak_sensitivity(sensitivity)
 
-    def fits(first):
+    def fit_both_laws(first):
         return [_fit_slope(t, grown[first:]) for t in (time[first:], jnp.log(time[first:]))]
 
-    (_, miss), (_, other) = fits(1 + len(time) // 10)
-    (rate, _), (power, _) = fits(len(time) // 2)
-    exponential = miss < other
+    (_, exponential_misfit), (_, power_misfit) = fit_both_laws(1 + len(time) // 10)
+    (rate, _), (power, _) = fit_both_laws(len(time) // 2)
+    exponential = exponential_misfit < power_misfit
     return exponential, jnp.where(exponential, rate, 0.0), jnp.where(exponential, 0.0, power)
 
 

@@ -1,33 +1,36 @@
 """Shots through bounces: a fan of directions is flown, and the best of it refined.
 
-A path that bounces moves with its launch in pieces: harder may be farther or not, sooner or later, and one more bounce
-is another piece. So nothing can be followed from one shot to all others, and all directions are tried.
+A path that bounces depends on its launch piecewise: a faster shot may go farther or not, arrive sooner or later, and
+one more bounce is another piece. No solution can be continued from one shot to all others, so all directions are tried.
 """
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.scene import Scene
 from physjax.study.inverse.shooting import AimProblem, Launch, find_nearest_launch
 from physjax.vectors import dot, norm, scale
 
 PLANE_DIRECTIONS, SPACE_RINGS_AND_DIRECTIONS = 256, (24, 32)
-"""Directions of the fan: around the circle in the plane; in space on so many rings, so many on each."""
+"""Directions of the fan: around the circle in the plane; in space the rings, and the directions on each."""
 FAN_STEPS = 96
 """Steps of a flight in the fan, growing with time."""
 REFINED_DIRECTIONS = 8
 """Best directions of the fan that are refined."""
+LATER_RANK = 1e6
+"""Added to the rank [m] of what is a last resort: beyond any distance between a shot and its target."""
 
 
 def find_ricochet(
     shots: AimProblem, speed: Float[Array, "*lanes"], late: Bool[Array, ""], bounces: int
 ) -> tuple[Launch, Bool[Array, "*lanes"]]:
-    """The launch at a speed [m/s] that hits after so many bounces, the soonest or the latest, and whether it bounces so.
+    """The launch at a speed [m/s] that hits after `bounces`, the soonest or the latest; and whether it bounces that often.
 
     Where none hits, the one that comes nearest. What lies between the directions of the fan may be overlooked.
     """
@@ -41,27 +44,30 @@ def find_ricochet(
     order = jnp.where(late, -launches.time, launches.time)
     # hits come first, by time; then the nearest with the right number of bounces; then the others
     worst = 2 * jnp.max(jnp.where(jnp.isfinite(launches.time), launches.time, 0.0)) + 1
-    rank = jnp.where(hit, order, worst + jnp.where(right, distance, 1e6 + distance))
+    rank = jnp.where(hit, order, worst + jnp.where(right, distance, LATER_RANK + distance))
     chosen = jnp.argmin(jnp.where(jnp.isfinite(rank), rank, jnp.inf), axis=0)
     return jax.tree.map(lambda leaf: _pick_by_lane(leaf, chosen), (launches, right))
 
 
 def _count_impacts(shots: AimProblem, launch: Launch) -> Int[Array, "*lanes"]:
-    """How many of the flight's steps have an impact in them, one at its very end not counted."""
+    """The number of the flight's steps with an impact in them; one at the very end, on the target, does not count."""
     dt, number = launch.time / shots.steps, jnp.arange(shots.steps, dtype=jnp.int32)
 
     def step(carry, i):
         scene, count = carry
-        scene, touched, moved = _step_and_detect_impact(scene, shots.method, i.astype(dt.dtype) * dt, dt)
+        scene, struck, moved = _step_and_detect_impact(scene, shots.method, i.astype(dt.dtype) * dt, dt)
         last = i == shots.steps - 1
-        return (scene, count + jnp.where(last, moved, touched).astype(count.dtype)), None
+        return (scene, count + jnp.where(last, moved, struck).astype(count.dtype)), None
 
     begin = (shots.with_launch_velocity(launch.velocity), jnp.zeros(launch.time.shape, jnp.int32))
     return lax.scan(step, begin, number)[0][1]
 
 
-def _step_and_detect_impact(scene: Scene, method: Any, t: Array, dt: Array) -> tuple[Scene, Array, Array]:
-    """A step, whether an impact changed where it leads, velocity included, and whether the position."""
+def _step_and_detect_impact(
+    scene: Scene, method: Callable[..., PyTree], t: Array, dt: Array
+) -> tuple[Scene, Array, Array]:
+    """A step; whether an impact in it changed position or velocity at its end, and whether the position."""
+    # the same step without contacts differs exactly where there was an impact
     after, free = scene.step(method, t, dt), scene.replace(contacts=()).step(method, t, dt).state
     rounding = float(jnp.finfo(free.dtype).eps) ** 0.5
     fast = jnp.maximum(norm(free.velocity), norm(scene.state.velocity))
@@ -70,7 +76,7 @@ def _step_and_detect_impact(scene: Scene, method: Any, t: Array, dt: Array) -> t
 
 
 def _pick_launches(shots: AimProblem, speed: Array, bounces: int) -> Launch:
-    """The launches of the fan that come nearest, of all that do better than their neighbours; stacked in front."""
+    """The launches of the fan that come nearest among the local minima over directions; stacked along the first axis."""
     fan = _build_directions(shots.target.shape[-1], shots.scene.up, speed.dtype)
     shape = fan.shape[:2]
     launch = lambda direction: scale(speed, jnp.broadcast_to(direction, shots.target.shape))  # noqa: E731
@@ -83,14 +89,14 @@ def _pick_launches(shots: AimProblem, speed: Array, bounces: int) -> Launch:
     lowest = jnp.isfinite(grid)
     for neighbour in neighbours:
         lowest = lowest & (grid <= neighbour)
-    # those that beat their neighbours first, then the others, so that there is always something to refine
-    rank = jnp.where(lowest, grid, 1e6 + grid).reshape(distance.shape)
+    # local minima first, then the others, so that there is always something to refine
+    rank = jnp.where(lowest, grid, LATER_RANK + grid).reshape(distance.shape)
     best = jnp.moveaxis(lax.top_k(-jnp.moveaxis(rank, 0, -1), REFINED_DIRECTIONS)[1], -1, 0)
     velocity = jax.vmap(lambda chosen: scale(speed, rows[chosen]))(best)
     return Launch(velocity, jax.vmap(lambda chosen: _pick_by_lane(time, chosen))(best))
 
 
-def _build_directions(dim: int, up: int, dtype: Any) -> Float[Array, "up around dim"]:
+def _build_directions(dim: int, up: int, dtype: np.dtype) -> Float[Array, "up around dim"]:
     """Unit vectors, evenly around a circle, or on rings from nearly straight down to nearly straight up."""
     around = lambda count: 2 * math.pi / count * (jnp.arange(count, dtype=dtype) + 0.5)  # noqa: E731
     if dim == 2:
@@ -102,21 +108,21 @@ def _build_directions(dim: int, up: int, dtype: Any) -> Float[Array, "up around 
 
 
 def _find_closest_approach(shots: AimProblem, velocity: Array, speed: Array, bounces: int) -> tuple[Array, Array]:
-    """How near a shot comes while it has bounced so many times [m], and when [s]: chord by chord."""
+    """How near a shot comes after exactly `bounces` [m], and when [s]: the nearest point of the chord of each step."""
     first, growth = _choose_time_grid(shots, speed, bounces)
 
     def step(carry, i):
         scene, count, t, best, when = carry
         after = first * growth**i
         dt, x = after - t, scene.state.position
-        scene, touched, _ = _step_and_detect_impact(scene, shots.method, t, dt)
+        scene, struck, _ = _step_and_detect_impact(scene, shots.method, t, dt)
         chord = scene.state.position - x
         length = dot(chord, chord)
         share = jnp.clip(dot(shots.target - x, chord) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
         away = norm(x + scale(share, chord) - shots.target)
-        better = (count == bounces) & ~touched & (away < best)
+        better = (count == bounces) & ~struck & (away < best)
         best, when = jnp.where(better, away, best), jnp.where(better, t + share * dt, when)
-        return (scene, count + touched.astype(count.dtype), after, best, when), None
+        return (scene, count + struck.astype(count.dtype), after, best, when), None
 
     still = jnp.zeros_like(speed)
     begin = (shots.with_launch_velocity(velocity), jnp.zeros(still.shape, jnp.int32), still, still + jnp.inf, first)
@@ -127,7 +133,7 @@ def _find_closest_approach(shots: AimProblem, velocity: Array, speed: Array, bou
 def _choose_time_grid(shots: AimProblem, speed: Array, bounces: int) -> tuple[Array, Array]:
     """The first moment of a fan's flight [s], and the ratio of each to the one before.
 
-    The last is as late as flights at this speed can be without drag, from bounce to bounce.
+    The last is the latest that a flight at this speed can last without drag, from bounce to bounce.
     """
     distance, rest_acceleration = norm(shots.offset), norm(shots.rest_acceleration)
     first = distance / (8 * speed)
@@ -138,6 +144,6 @@ def _choose_time_grid(shots: AimProblem, speed: Array, bounces: int) -> tuple[Ar
 
 
 def _pick_by_lane(leaves: Array, chosen: Array) -> Array:
-    """From arrays stacked in front, lane by lane the chosen one."""
+    """From arrays stacked along the first axis, the chosen one for each lane."""
     index = chosen.reshape((1,) + chosen.shape + (1,) * (leaves.ndim - 1 - chosen.ndim))
     return jnp.take_along_axis(leaves, index, axis=0)[0]

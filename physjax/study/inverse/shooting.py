@@ -1,23 +1,24 @@
-"""The search behind `aim_at`: which launches are at a target after some time of flight.
+"""The search behind `aim_at`: the launches that reach a target after some time of flight.
 
-For every flight time T there is a launch velocity that is at the target then, and it follows T smoothly: without drag
-v(T) = Δ/T - ½aT. Its speed falls to a least one and rises again, so a given speed is met twice, by the low arc before
-that valley and by the high arc behind it, or never. Seen in this way nothing is special about the edge of reach, a
+For every flight time T there is a launch velocity v(T) that is at the target then, and it depends smoothly on T: without
+drag v(T) = Δ/T - ½aT. Its speed falls to a minimum and rises again, so a given speed is met twice, by the low arc before
+that minimum and by the high arc after it, or never. In this formulation nothing is special about the edge of reach, a
 target overhead, crosswind or the third dimension.
 """
 
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import any_lane, bounded_while_loop, compact_and_apply
+from physjax.linear import solve_columns
 from physjax.loops import RECORD
 from physjax.particles import Particles
 from physjax.scene import Scene
@@ -26,13 +27,26 @@ from physjax.trajectory import Trajectory
 from physjax.vectors import components, cross, dot, norm, scale, stack_components, turn_left, unit
 
 MAX_SEARCH_STEPS, MAX_DESCENT_STEPS = 40, 100
-"""Steps of a search, and of a descent to the nearest miss, after which it is given up."""
+"""Most steps of a search, and of a descent to the nearest miss."""
 COARSE_STEPS = 16
-"""Steps of a flight while the shot is still far from its target."""
+"""Steps of a flight while the shot is still far from its target: cheap, and near enough for the next phase to start."""
 HIT_ROUNDINGS = 512
-"""A target that is missed by no more than so many roundings of the flight's extent is hit."""
+"""A target that is missed by at most this many roundings of the flight's extent is hit."""
 MAX_TIME_FACTOR = math.e
 """A search changes the flight time by no more than this factor at once."""
+SECANT_SLOPES = (0.3, 10.0)
+"""Bounds of a secant's slope, which is 1 without drag: one taken across rounding may be anything."""
+MAX_DESCENT_ANGLE = 0.5
+"""A descent turns the launch by no more at once [rad], nor changes the log of the flight time by more."""
+FIRST_DAMPING, MAX_DAMPING = 1e-2, 1e8
+"""Damping of a descent's first step, relative to the largest square of a slope; and beyond which no step is small enough."""
+DAMPING_DECREASE, DAMPING_INCREASE = 0.3, 3.0
+"""Factors of the damping after a step that came closer, and after one that did not."""
+SMALL_STEP_SHARE = 0.1
+"""A descent's steps are small below this share of √eps: what is left of the miss is then quadratic in it."""
+
+
+State = TypeVar("State")
 
 
 class Launch(NamedTuple):
@@ -47,7 +61,7 @@ class AimProblem(eqx.Module):
 
     scene: Scene = eqx.field(metadata=RECORD)
     target: Float[Array, "*lanes dim"] = eqx.field(metadata=RECORD)
-    method: Any
+    method: Callable[..., PyTree]
     steps: int = eqx.field(static=True)
 
     @property
@@ -66,8 +80,10 @@ class AimProblem(eqx.Module):
         scene = self.scene
         return Scene(Particles(scene.state.position, velocity), scene.mass, scene.forces, scene.contacts)
 
-    def flight(self, launch: Launch, *, save_every: int | None = None, record: Any = None) -> Trajectory:
-        """The flight in equal steps that end at its time; only its ends are kept unless told otherwise."""
+    def flight(
+        self, launch: Launch, *, save_every: int | None = None, record: Callable[..., PyTree] | None = None
+    ) -> Trajectory:
+        """The flight in equal steps that end at its time; only its ends are kept by default."""
         dt, steps = launch.time / self.steps, self.steps
         scene = self.with_launch_velocity(launch.velocity)
         return simulate(scene, self.method, dt=dt, steps=steps, save_every=save_every or steps, record=record)
@@ -78,7 +94,9 @@ class AimProblem(eqx.Module):
         Those have no reverse mode.
         """
         if steps is None:
-            return self.flight(launch).final_scene.state.position - self.target
+            end = self.flight(launch).final_scene
+            assert end is not None
+            return end.state.position - self.target
         dt = launch.time / steps.astype(launch.time.dtype)
         return (
             sample_states(self.with_launch_velocity(launch.velocity), self.method, dt, steps, 1).position[1]
@@ -86,7 +104,7 @@ class AimProblem(eqx.Module):
         )
 
     def rounding(self, launch: Launch) -> Float[Array, "*lanes"]:
-        """What rounding leaves of a miss [m]: of the flight's extent and, far from the origin, of a place at every step.
+        """The miss that rounding leaves [m]: of the flight's extent and, far from the origin, of a place at every step.
 
         A miss beyond the square root of a rounding of the extent is one, wherever the shot is fired.
         """
@@ -109,11 +127,11 @@ class AimProblem(eqx.Module):
         axes = [jnp.broadcast_to(row, v.shape) for row in jnp.eye(v.shape[-1], dtype=v.dtype)]
         directions = [Launch(axis, jnp.zeros_like(time)) for axis in axes] + [Launch(jnp.zeros_like(v), time)]
         miss, (*by_velocity, by_time) = self.sensitivity(launch, directions, steps)
-        return solve_columns(by_velocity, miss), -solve_columns(by_velocity, by_time)
+        return _solve_vectors(by_velocity, miss), -_solve_vectors(by_velocity, by_time)
 
 
 class _Search(NamedTuple):
-    """Where the search for each lane is, what it last did (log of time: missing and moved), and whether it goes on."""
+    """Where the search of each lane is, its last error and step in the log of time, and whether it continues."""
 
     launch: Launch
     log_time_error: Array
@@ -122,7 +140,7 @@ class _Search(NamedTuple):
 
 
 def guess_launch(shots: AimProblem, speed: Float[Array, "*lanes"] | None) -> Launch:
-    """The launch in the valley as if the acceleration at rest stayed: T = √(2|Δ|/a), v = Δ/T - ½aT, not above the speed."""
+    """The launch of least speed under the constant acceleration at rest: T = √(2|Δ|/a), v = Δ/T - ½aT, at most the speed."""
     rest_acceleration = shots.rest_acceleration
     distance, strength = norm(shots.offset), norm(rest_acceleration)
     pulled = strength > 0
@@ -139,11 +157,11 @@ def find_launch(
 ) -> tuple[Launch, Bool[Array, "*lanes"]]:
     """The launch that hits at a speed [m/s], on the low arc or the `late` one, and whether it was found.
 
-    Without a speed, the one that hits at the least. A lane whose target is out of reach comes to lie in the valley, with
-    the least speed that would do. Flights of few steps lead near, those of all steps to the end.
+    Without a speed, the one that hits at the least. A lane whose target is out of reach ends at the minimum, with the
+    least speed that would reach it. Flights of few steps lead near the solution, those of all steps to its last digits.
     """
     guess = guess_launch(shots, speed)
-    # a step from so near leads to the last digits where convergence is quadratic
+    # convergence is quadratic: a step from this near leads to the last digits; a secant's converges slower
     enough = float(jnp.finfo(guess.time.dtype).eps) ** (0.5 if speed is not None else 0.75)
     steps = jnp.array([min(COARSE_STEPS, shots.steps), shots.steps], jnp.int32)
     phases = (steps, jnp.array([1e-3, enough], guess.time.dtype))
@@ -171,13 +189,19 @@ def _advance_search(
     return _Search(launch, log_time_error, log_time_step, ~(jnp.maximum(jnp.abs(log_time_step), correction) <= enough))
 
 
-def _iterate_lanes(closer: Callable, begin: Any, shots: AimProblem, speed: Array | None, most: int) -> Any:
-    """`closer(search, shots, speed)` again and again for the lanes that are `active`: a few hard ones hold up no others."""
+def _iterate_lanes(
+    improve: Callable[[State, AimProblem, Array | None], State],
+    begin: State,
+    shots: AimProblem,
+    speed: Array | None,
+    most: int,
+) -> State:
+    """Repeat `improve(search, shots, speed)` for the lanes that are `active`: a few hard ones do not hold up the others."""
     others = (shots, speed)
     cut, masks = shots.scene.may_be_cut(), shots.scene.build_lane_mask(others)
 
     def once(search, shots, speed):
-        after = closer(search, shots, speed)
+        after = improve(search, shots, speed)
         return select_where(search.active, after, search)
 
     def body(search):
@@ -189,7 +213,7 @@ def _iterate_lanes(closer: Callable, begin: Any, shots: AimProblem, speed: Array
 def _estimate_launch(
     shots: AimProblem, search: _Search, speed: Array | None, late: Array | None, steps: Array
 ) -> tuple[Launch, Array, Array]:
-    """The launch that would be right if v(T) were like a parabola's from here, what is missing, and the correction of v.
+    """The launch that is right if v(T) is as without drag from here, the error in log T, and the correction of v.
 
     With u = log T, v = A exp(-u) + B exp(u) has the value and slope found here; it is exact without drag.
     """
@@ -202,13 +226,14 @@ def _estimate_launch(
     if speed is None:
         log_time_error = 0.5 * jnp.log(a / b)
         # the secant through this point and the last, since v(u) bends more with drag than without
-        bends = jnp.where(
+        slope = jnp.where(
             search.log_time_step != 0,
             (search.log_time_error - log_time_error) / jnp.where(search.log_time_step != 0, search.log_time_step, 1),
             1,
         )
-        change = log_time_error / jnp.clip(bends, 0.3, 10.0)
+        change = log_time_error / jnp.clip(slope, *SECANT_SLOPES)
     else:
+        assert late is not None
         middle = jnp.maximum(speed * speed - 2 * both, 2 * a * b)
         total = middle + jnp.sqrt((middle - 2 * a * b) * (middle + 2 * a * b))
         change = log_time_error = 0.5 * jnp.log(jnp.where(late, total / (2 * b * b), 2 * a * a / total))
@@ -218,7 +243,7 @@ def _estimate_launch(
 
 
 class _Descent(NamedTuple):
-    """Where the descent of each lane is, by how much it misses, with which slopes and damping, and whether it goes on."""
+    """Where the descent of each lane is, its miss, slopes and damping, and whether it continues."""
 
     launch: Launch
     distance: Array
@@ -238,10 +263,13 @@ def find_nearest_launch(
     are small and, where it hits, when they no longer halve the distance: then only rounding is left of it.
     """
     still, zero = jnp.zeros_like(start.time), jnp.zeros_like(start.velocity)
-    steps, least = jnp.array(shots.steps, jnp.int32), 0.1 * float(jnp.finfo(still.dtype).eps) ** 0.5
+    steps, least = jnp.array(shots.steps, jnp.int32), SMALL_STEP_SHARE * float(jnp.finfo(still.dtype).eps) ** 0.5
 
-    def closer(now, shots, speed):
-        step = [jnp.clip(part, -0.5, 0.5) for part in components(_solve_damped_step(now.slopes, now.miss, now.damping))]
+    def descend(now, shots, speed):
+        step = [
+            jnp.clip(part, -MAX_DESCENT_ANGLE, MAX_DESCENT_ANGLE)
+            for part in components(_solve_damped_step(now.slopes, now.miss, now.damping))
+        ]
         aside = sum(
             scale(angle, turn) for angle, turn in zip(step, perpendicular_axes(now.launch.velocity), strict=False)
         )
@@ -254,16 +282,16 @@ def find_nearest_launch(
         small = (norm(stack_components(step)) <= least) & jnp.isfinite(now.distance)
         # a damped step leaves a share of the miss; the distance of a nearest miss stays, that of a hit goes on falling
         falls = norm(miss) < 0.5 * now.distance
-        after = _Descent(tried, norm(miss), miss, tuple(slopes), 0.3 * now.damping, now.active)
-        worse = now._replace(damping=3.0 * now.damping)
+        after = _Descent(tried, norm(miss), miss, tuple(slopes), DAMPING_DECREASE * now.damping, now.active)
+        worse = now._replace(damping=DAMPING_INCREASE * now.damping)
         after = select_where(better, after, worse)
-        return after._replace(active=~(small & ~falls) & (after.damping < 1e8))
+        return after._replace(active=~(small & ~falls) & (after.damping < MAX_DAMPING))
 
     # the first step is none at all, and finds the slopes
     axes = tuple(jnp.broadcast_to(row, zero.shape) for row in jnp.eye(zero.shape[-1], dtype=zero.dtype))
     start = Launch(scale(speed, unit(start.velocity)), start.time)
-    begin = _Descent(start, still + jnp.inf, zero, axes, still + 1e-2, wanted)
-    end = _iterate_lanes(closer, begin, shots, speed, MAX_DESCENT_STEPS)
+    begin = _Descent(start, still + jnp.inf, zero, axes, still + FIRST_DAMPING, wanted)
+    end = _iterate_lanes(descend, begin, shots, speed, MAX_DESCENT_STEPS)
     return end.launch, end.distance
 
 
@@ -277,7 +305,7 @@ def _solve_damped_step(slopes: tuple[Array, ...], miss: Array, damping: Array) -
         stack_components([dot(a, b) + (damping * largest if i == j else 0.0) for i, a in enumerate(slopes)])
         for j, b in enumerate(slopes)
     ]
-    return -solve_columns(normal, stack_components([dot(slope, miss) for slope in slopes]))
+    return -_solve_vectors(normal, stack_components([dot(slope, miss) for slope in slopes]))
 
 
 def perpendicular_axes(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes dim"]]:
@@ -293,22 +321,14 @@ def perpendicular_axes(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array
     return [first, cross(along, first)]
 
 
-def solve_columns(
+def _solve_vectors(
     columns: list[Float[Array, "*lanes dim"]], b: Float[Array, "*lanes dim"]
 ) -> Float[Array, "*lanes dim"]:
-    """The solution of Σ xᵢ columnᵢ = b, for each lane, in two or three dimensions: Cramer's rule."""
-    if len(columns) == 2:
-        p, q = columns
-        across = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # noqa: E731
-        volumes, volume = [across(b, q), across(p, b)], across(p, q)
-    else:
-        p, q, r = columns
-        around = cross(q, r)
-        volumes, volume = [dot(b, around), dot(b, cross(r, p)), dot(b, cross(p, q))], dot(p, around)
-    return stack_components([part / volume for part in volumes])
+    """The solution of Σ xᵢ columnᵢ = b, for each lane."""
+    return stack_components(solve_columns([components(column) for column in columns], components(b)))
 
 
-def select_where(flag: Bool[Array, "*lanes"], new: Any, old: Any) -> Any:
+def select_where(flag: Bool[Array, "*lanes"], new: State, old: State) -> State:
     """Lane by lane the new where flagged, else the old, for trees of numbers and vectors."""
     one = lambda a, b: jnp.where(flag if a.ndim == flag.ndim else flag[..., None], a, b)  # noqa: E731
     return jax.tree.map(one, new, old)

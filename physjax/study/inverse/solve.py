@@ -1,20 +1,20 @@
 """Equations and objectives made of simulations: roots, least squares, minima, with bounds and derivatives.
 
-The functions take the unknown, a number or a pytree of real arrays, and may close over anything. The answer has
+The functions take the unknown, a number or a pytree of real arrays, and may close over anything. The solution has
 derivatives with respect to all of that, forward and reverse, by the implicit function theorem: one linear solve, however
-long the search was. Everything works under `jit` and `vmap`; what is not found is a status, never an exception.
-optimistix does the search, and is imported when first used.
+long the search was. Everything works under `jit` and `vmap`; a solution that is not found is a status, never an
+exception. optimistix does the search, and is imported when first used.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import as_positive_integer, as_real_array, as_real_quantity, concrete_or_none, demand_all
 
@@ -23,10 +23,10 @@ MAX_NEWTON_STEPS = 8
 
 
 class Solution(NamedTuple):
-    """The unknown, the residual there, whether that is a root (or the least of its squares), and steps of the search."""
+    """The unknown, the residual there, whether that is a root (or least squares), and the steps of the search."""
 
-    value: Any
-    residual: Any
+    value: PyTree
+    residual: PyTree
     ok: Bool[Array, ""]
     steps: Int[Array, ""]
 
@@ -34,18 +34,18 @@ class Solution(NamedTuple):
 class Minimum(NamedTuple):
     """The unknown, the cost there, whether the search ended in a minimum, and its steps."""
 
-    value: Any
+    value: PyTree
     cost: Float[Array, ""]
     ok: Bool[Array, ""]
     steps: Int[Array, ""]
 
 
 def solve(
-    residual: Callable,
-    guess: Any,
+    residual: Callable[[PyTree], PyTree],
+    guess: PyTree,
     *,
-    lower: Any = None,
-    upper: Any = None,
+    lower: PyTree = None,
+    upper: PyTree = None,
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int = 256,
@@ -57,7 +57,7 @@ def solve(
     guess, which must lie strictly between them. The search ends where a step changes value and residual by less than
     `atol + rtol·|·|`, each √eps of the dtype unless given.
 
-    Raises ValueError or TypeError for guesses, bounds and tolerances that cannot be, and for fewer equations than
+    Raises ValueError or TypeError for impossible guesses, bounds and tolerances, and for fewer equations than
     unknowns.
 
     Example:
@@ -77,39 +77,55 @@ def solve(
     if count < start.size:
         raise ValueError(
             f"solve: got {count} equations for {start.size} unknowns, expected at least as many. Leave unknowns out, or "
-            "say with minimise which of the many answers is wanted."
+            "say with minimise which of the many solutions is wanted."
         )
     square = count == start.size
     searched = _stop_closure_gradients(equations, start) if square else equations
-    safe = optimistix.LevenbergMarquardt(rtol, atol)
-    found = optimistix.least_squares(searched, safe, start, **limits)
+    found = optimistix.least_squares(searched, optimistix.LevenbergMarquardt(rtol, atol), start, **limits)
     if square:
-        newton = optimistix.Newton(rtol, atol)
-        root = optimistix.root_find(equations, newton, found.value, max_steps=MAX_NEWTON_STEPS, throw=False).value
-        left = lambda at: jnp.max(jnp.abs(searched(lax.stop_gradient(at), None)))  # noqa: E731
-        vanishing = atol + rtol * left(start)
-        # the derivatives are those of the Newton step: the search's would take second derivatives of the equations
-        inner = jnp.where(left(root) <= jnp.maximum(left(found.value), vanishing), root, found.value)
-        ok = left(inner) <= vanishing
+        inner, ok = _polish_root(equations, searched, start, found.value, rtol, atol)
     else:
         inner, ok = found.value, found.result == optimistix.RESULTS.successful
     value = box.value(inner)
     return Solution(value, residual(value), ok & jnp.all(jnp.isfinite(inner)), found.stats["num_steps"])
 
 
+def _polish_root(
+    equations: Callable[[Array, None], Array],
+    searched: Callable[[Array, None], Array],
+    start: Array,
+    found: Array,
+    rtol: float,
+    atol: float,
+) -> tuple[Array, Bool[Array, ""]]:
+    """The root that Newton's method finds from where the safe search ended, or that end; and whether it is a root.
+
+    `searched` are the equations without the derivatives in what they close over.
+    """
+    import optimistix
+
+    newton = optimistix.Newton(rtol, atol)
+    root = optimistix.root_find(equations, newton, found, max_steps=MAX_NEWTON_STEPS, throw=False).value
+    largest_residual = lambda at: jnp.max(jnp.abs(searched(lax.stop_gradient(at), None)))  # noqa: E731
+    vanishing = atol + rtol * largest_residual(start)
+    # the derivatives are those of the Newton step: the search's would take second derivatives of the equations
+    inner = jnp.where(largest_residual(root) <= jnp.maximum(largest_residual(found), vanishing), root, found)
+    return inner, largest_residual(inner) <= vanishing
+
+
 def minimise(
-    cost: Callable,
-    guess: Any,
+    cost: Callable[[PyTree], Array],
+    guess: PyTree,
     *,
-    lower: Any = None,
-    upper: Any = None,
+    lower: PyTree = None,
+    upper: PyTree = None,
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int = 256,
 ) -> Minimum:
     """A minimum of the number `cost(value)`, by the quasi-Newton method of Broyden, Fletcher, Goldfarb and Shanno.
 
-    Bounds, tolerances and errors as in `solve`; at an active bound the answer moves with the bound. A minimum whose
+    Bounds, tolerances and errors as in `solve`; at an active bound the minimum moves with the bound. A minimum whose
     second derivatives are singular has no derivatives.
 
     Example:
@@ -153,13 +169,13 @@ class _Bounds(NamedTuple):
     lower: Array | None
     upper: Array | None
     unit: Array
-    unravel: Callable
+    unravel: Callable[[Array], PyTree]
 
-    def value(self, inner: Array) -> Any:
+    def value(self, inner: Array) -> PyTree:
         """The value for unbounded numbers."""
-        if self.lower is None:
+        if self.lower is None or self.upper is None:
             return self.unravel(inner)
-        low, high, both = self._finite_bounds()
+        low, high, both = _replace_infinite(self.lower, self.upper)
         between = low + 0.5 * (high - low) * (jnp.sin(inner) + 1)
         away = self.unit * (jnp.sqrt(inner * inner + 1) - 1)
         above, below = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
@@ -169,22 +185,23 @@ class _Bounds(NamedTuple):
 
     def inner(self, value: Array) -> Array:
         """The unbounded numbers of a flat value strictly between the bounds."""
-        if self.lower is None:
+        if self.lower is None or self.upper is None:
             return value
-        low, high, both = self._finite_bounds()
+        low, high, both = _replace_infinite(self.lower, self.upper)
         between = jnp.arcsin(jnp.clip(2 * (value - low) / (high - low) - 1, -1, 1))
         away = jnp.where(jnp.isfinite(self.lower), value - low, high - value) / self.unit + 1
         single = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
         hyperbola = jnp.sqrt(jnp.maximum(away * away - 1, 0))
         return jnp.where(both, between, jnp.where(single, hyperbola, value))
 
-    def _finite_bounds(self) -> tuple[Array, Array, Array]:
-        """Finite stand-ins for both bounds, and where both are there."""
-        low, high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        return jnp.where(low, self.lower, 0.0), jnp.where(high, self.upper, 1.0), low & high
+
+def _replace_infinite(lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+    """Finite stand-ins for both bounds, since a branch that is not taken must not be NaN either; and where both are given."""
+    low, high = jnp.isfinite(lower), jnp.isfinite(upper)
+    return jnp.where(low, lower, 0.0), jnp.where(high, upper, 1.0), low & high
 
 
-def _build_bounds(who: str, guess: Any, lower: Any, upper: Any) -> tuple[_Bounds, Array]:
+def _build_bounds(who: str, guess: PyTree, lower: PyTree, upper: PyTree) -> tuple[_Bounds, Array]:
     """The bounds, and the unbounded numbers to start from."""
     guess = jax.tree.map(lambda leaf: as_real_quantity(f"{who}: guess", leaf), guess)
     flat, unravel = ravel_pytree(guess)
@@ -196,8 +213,9 @@ def _build_bounds(who: str, guess: Any, lower: Any, upper: Any) -> tuple[_Bounds
         _flatten_bound(who, "lower", lower, guess, -jnp.inf),
         _flatten_bound(who, "upper", upper, guess, jnp.inf),
     )
-    if all(concrete_or_none(array) is not None for array in (flat, low, high)):
-        inside = (concrete_or_none(low) < concrete_or_none(flat)) & (concrete_or_none(flat) < concrete_or_none(high))
+    known_flat, known_low, known_high = map(concrete_or_none, (flat, low, high))
+    if known_flat is not None and known_low is not None and known_high is not None:
+        inside = (known_low < known_flat) & (known_flat < known_high)
         demand_all(f"{who}: guess", flat, inside, "values strictly between lower and upper")
     middle = lax.stop_gradient(flat)
     unit = jnp.where(jnp.isfinite(low), middle - low, jnp.where(jnp.isfinite(high), high - middle, 1.0))
@@ -205,7 +223,7 @@ def _build_bounds(who: str, guess: Any, lower: Any, upper: Any) -> tuple[_Bounds
     return box, lax.stop_gradient(box.inner(flat))
 
 
-def _flatten_bound(who: str, name: str, bound: Any, guess: Any, absent: float) -> Array:
+def _flatten_bound(who: str, name: str, bound: PyTree, guess: PyTree, absent: float) -> Array:
     """A bound for every number of the guess, flat."""
     if bound is None:
         bound = absent

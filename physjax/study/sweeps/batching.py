@@ -1,6 +1,6 @@
-"""A measure as one compiled program over many lanes: traced once, judged lane by lane, run in blocks.
+"""A measure as one compiled program over many lanes: traced once, with a status for each lane, run in blocks.
 
-A block is a `vmap` over so many lanes as fit a cache; a batch is some blocks one after the other, on every device its share.
+A block is a `vmap` over as many lanes as fit a cache; a batch is a few blocks in sequence, shared out over the devices.
 """
 
 import functools
@@ -9,26 +9,24 @@ import inspect
 import linecache
 import math
 import traceback
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.core import ShapedArray
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Var, jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, PyTree
 
-from physjax.stepping.blocks import LANES_PER_BLOCK
-from physjax.stepping.simulate import WIDE_VECTOR_OPTIONS
-from physjax.study.sweeps.design import leaf_name
-from physjax.study.sweeps.fingerprint import find_host_calls, list_inner_jaxprs, persistent_digest
+from physjax.backend import MAX_BATCH_LANES, choose_block_lanes, jit_untransformed
+from physjax.study.sweeps.design import KeyPath, leaf_name
+from physjax.study.sweeps.fingerprint import HostCall, find_host_calls, list_inner_jaxprs, persistent_digest
 from physjax.trajectory import Trajectory
 
-MAX_CARRIED_BYTES = 64 * LANES_PER_BLOCK
-"""Bytes of a block that a turn of a loop may hand on, to stay in a core's cache with the stages of a step."""
-MAX_BATCH_LANES = 16 * LANES_PER_BLOCK
-"""Lanes in a batch at most: more gain nothing, and a batch is what a kill loses and what progress is counted in."""
 FAILURE_TEXTS = {
     "Run": "blew up: the run's state is not finite at its end",
     "Solution": "not solved: the search ended without a root",
@@ -37,31 +35,31 @@ FAILURE_TEXTS = {
     "Aimed": "out of reach",
     "Shot": "out of reach",
 }
-"""What it means that a result is not `ok`, by its type; others say only that."""
+"""What it means that a result is not `ok`, by its type; of any other type, only that it is not."""
 
 
 class Run(NamedTuple):
-    """What is kept of a `Trajectory` that a measure returns: frames or what was recorded, and whether it held."""
+    """What is kept of a `Trajectory` that a measure returns: frames or what was recorded, and whether it stayed finite."""
 
-    time: Any
-    state: Any
-    recorded: Any
-    ok: Any
+    time: Array | None
+    state: PyTree
+    recorded: PyTree
+    ok: Bool[Array | np.ndarray, "..."]
 
 
 class LaneProgram(NamedTuple):
     """A measure as a program for one lane: `jaxpr` from the leaves of a point to those of its values and a status.
 
     `values` is the tree of the values, with shapes and dtypes in its leaves; status k means `reasons[k]`, 0 is good.
-    `carried_bytes` and `peak_bytes` are the bytes that its loops carry, and that are alive at a time, at most. `digest` is a hash of
-    the program with the constants it closes over, `calls` what it calls outside of itself, which no hash of it tells.
+    `carried_bytes` and `peak_bytes` are the most bytes that its loops carry, and that are alive at once. `digest` is a
+    hash of the program with the constants it closes over, `calls` what it calls on the host, which that hash leaves out.
     """
 
     jaxpr: ClosedJaxpr
-    values: Any
+    values: PyTree
     reasons: tuple[str, ...]
     digest: str
-    calls: tuple[tuple[str, Any], ...] = ()
+    calls: tuple[HostCall, ...] = ()
 
     def __eq__(self, other: object) -> bool:
         # functions that are called back must be the very same: equal ones may close over arrays that change later
@@ -71,7 +69,7 @@ class LaneProgram(NamedTuple):
         return hash(self._key)
 
     @property
-    def _key(self) -> tuple:
+    def _key(self) -> tuple[object, ...]:
         return (self.digest, *((kind, id(called)) for kind, called in self.calls))
 
     @property
@@ -81,12 +79,12 @@ class LaneProgram(NamedTuple):
 
     @property
     def carried_bytes(self) -> int:
-        """Bytes that a turn of a loop hands on, at most; without loops all that is alive."""
+        """The most bytes that an iteration of a loop carries; without loops all that is alive."""
         return _max_carried_bytes(self.jaxpr.jaxpr) or self.peak_bytes
 
     @property
     def peak_bytes(self) -> int:
-        """Bytes alive at a time, at most, if nothing is fused."""
+        """The most bytes alive at once, if nothing is fused."""
         return max(1, _max_peak_bytes(self.jaxpr.jaxpr))
 
     @property
@@ -96,16 +94,16 @@ class LaneProgram(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """How lanes are cut: `count` blocks of `size` lanes make a batch, of which `batch` lanes are used."""
+    """How lanes are divided: `count` blocks of `size` lanes make a batch, of which `batch` lanes are used."""
 
     batch: int
     size: int
     count: int
 
 
-def trace_measure(measure: Callable, point: Any) -> LaneProgram:
+def trace_measure(measure: Callable[..., PyTree], point: Mapping[str, PyTree]) -> LaneProgram:
     """Trace a measure at a point, given as shapes and dtypes by name."""
-    seen = []
+    traced = []
 
     def lane(point):
         values = jax.tree.map(jnp.asarray, _strip_runs(measure(**point)))
@@ -113,7 +111,7 @@ def trace_measure(measure: Callable, point: Any) -> LaneProgram:
         status = jnp.zeros((), jnp.int16)
         for code in range(len(reasons), 0, -1):
             status = jnp.where(reasons[code - 1][1], status, jnp.int16(code))
-        seen.append((jax.eval_shape(lambda: values), ("ok", *(reason for reason, _ in reasons))))
+        traced.append((jax.eval_shape(lambda: values), ("ok", *(reason for reason, _ in reasons))))
         return values, status
 
     leaves, tree = jax.tree.flatten(point)
@@ -121,7 +119,7 @@ def trace_measure(measure: Callable, point: Any) -> LaneProgram:
         jaxpr = jax.make_jaxpr(lambda *flat: jax.tree.leaves(lane(jax.tree.unflatten(tree, flat))))(*leaves)
     except TypeError as error:
         raise TypeError(_trace_error_text(measure, point, error)) from error
-    values, reasons = seen[-1]
+    values, reasons = traced[-1]
     if not jax.tree.leaves(values):
         raise ValueError(f"measure: {_measure_name(measure)} returned {values!r}, expected at least one number.")
     digest, calls = _hash_program(jaxpr, leaves)
@@ -132,13 +130,13 @@ def choose_layout(
     program: LaneProgram,
     lanes: int,
     memory: int,
-    devices: Sequence[Any],
+    devices: Sequence[jax.Device],
     batch: int | None = None,
     begun: tuple[int, int] | None = None,
 ) -> Layout:
-    """Blocks for so many lanes whose programs and batches fit into so many bytes; of a sweep that has begun, its own.
+    """Blocks for a number of lanes, such that program and batch fit into `memory` [bytes].
 
-    `begun` are the lanes in a batch and in a block of such a sweep.
+    `begun` are the lanes in a batch and in a block of a sweep that is being continued, which keeps them.
     """
     needed = program.peak_bytes + program.transferred_bytes
     if needed > memory:
@@ -150,28 +148,24 @@ def choose_layout(
         batch, size = begun
     else:
         share = math.ceil(min(lanes, batch or lanes) / len(devices))
-        # a CPU is fastest in its cache, anything else with all that it can hold
-        best = (
-            min(MAX_CARRIED_BYTES // program.carried_bytes, LANES_PER_BLOCK)
-            if devices[0].platform == "cpu"
-            else MAX_BATCH_LANES
-        )
+        best = choose_block_lanes(devices[0], program.carried_bytes)
         fitting = min(best, memory // (2 * len(devices) * program.peak_bytes))
         size = min(share, 1 << max(0, fitting.bit_length() - 1))
         left = memory - len(devices) * size * program.peak_bytes
         most = max(size, min(MAX_BATCH_LANES, left // (2 * program.transferred_bytes)) // size * size)
-        # batches of equal length in whole blocks
+        # batches of equal length in whole blocks, so that none is nearly empty
         batch = batch or math.ceil(lanes / math.ceil(lanes / most) / size) * size
         size = math.ceil(batch / math.ceil(batch / size))
     return Layout(batch, size, math.ceil(math.ceil(batch / size) / len(devices)) * len(devices))
 
 
 @functools.lru_cache(maxsize=16)
-def compile_batch(program: LaneProgram, cut: Layout, devices: tuple) -> Callable:
+def compile_batch(program: LaneProgram, cut: Layout, devices: tuple[jax.Device, ...]) -> Callable[..., Sequence[Array]]:
     """The batch as one executable: leaves `(count, size, ...)` of points to those of values, and status."""
     one = jax.vmap(jaxpr_as_fun(program.jaxpr))
 
     def batch(*flat):
+        # blocks in sequence: a core's cache then holds all that a step of one block touches
         return lax.map(lambda block: one(*block), flat)
 
     mesh = Mesh(np.asarray(devices), ("lanes",))
@@ -182,25 +176,24 @@ def compile_batch(program: LaneProgram, cut: Layout, devices: tuple) -> Callable
         jax.ShapeDtypeStruct((cut.count, cut.size, *v.aval.shape), v.aval.dtype) for v in program.jaxpr.jaxpr.invars
     ]
     placed = NamedSharding(mesh, spec)
-    options = WIDE_VECTOR_OPTIONS if devices[0].platform == "cpu" else None
-    whole = jax.jit(batch, in_shardings=placed, out_shardings=placed, compiler_options=options)
+    whole = jit_untransformed(batch, devices[0], in_shardings=placed, out_shardings=placed)
     executable = whole.lower(*shapes).compile()
     return lambda *flat: executable(*jax.device_put(flat, placed))
 
 
-def _strip_runs(outcome: Any) -> Any:
-    """What is kept of a measure's outcome: runs leave their scene behind."""
+def _strip_runs(outcome: PyTree) -> PyTree:
+    """A measure's outcome with every run reduced to its frames and status: its scene is the same in all lanes."""
     is_run = lambda node: isinstance(node, Trajectory)  # noqa: E731
     shorten = lambda node: Run(node.time, node.state, node.recorded, node.ok) if is_run(node) else node  # noqa: E731
     return jax.tree.map(shorten, outcome, is_leaf=is_run)
 
 
-def _list_verdicts(values: Any) -> list[tuple[str, Any]]:
-    """Reasons for which a lane may be bad, each with whether it is good: its own verdicts first, then its numbers."""
+def _list_verdicts(values: PyTree) -> list[tuple[str, Array]]:
+    """Reasons why a lane may be bad, each with whether it is good: the results' own `ok` first, then finite numbers."""
     judged = [
-        (f"{FAILURE_TEXTS.get(type(node).__name__, 'not ok')}{_format_path(path)}", jnp.all(_read_ok(node)))
+        (f"{FAILURE_TEXTS.get(type(node).__name__, 'not ok')}{_format_path(path)}", jnp.all(ok))
         for path, node in _list_nodes(values)
-        if _read_ok(node) is not None
+        if (ok := _read_ok(node)) is not None
     ]
     return judged + [
         (f"not finite{_format_path(path)}", jnp.all(jnp.isfinite(leaf)))
@@ -209,7 +202,7 @@ def _list_verdicts(values: Any) -> list[tuple[str, Any]]:
     ]
 
 
-def _list_nodes(tree: Any, path: tuple = ()) -> list[tuple[tuple, Any]]:
+def _list_nodes(tree: PyTree, path: KeyPath = ()) -> list[tuple[KeyPath, PyTree]]:
     """Every node of a tree that is not a leaf, with its path, the outer ones first."""
     below = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: node is not tree)
     if len(below) == 1 and below[0][1] is tree:
@@ -217,18 +210,21 @@ def _list_nodes(tree: Any, path: tuple = ()) -> list[tuple[tuple, Any]]:
     return [(path, tree)] + [found for keys, child in below for found in _list_nodes(child, (*path, *keys))]
 
 
-def _read_ok(node: Any) -> Any:
+def _read_ok(node: PyTree) -> ArrayLike | None:
+    """The `ok` of a result of ours or of a user's own record; None where there is none."""
     return node.get("ok") if isinstance(node, dict) else getattr(node, "ok", None)
 
 
-def _format_path(path: tuple) -> str:
+def _format_path(path: KeyPath) -> str:
     return f" (at {leaf_name(path)})" if path else ""
 
 
-def _hash_program(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
-    """A hash of what is computed, with the constants that it closes over, whatever the code is called and looks like.
+def _hash_program(
+    jaxpr: ClosedJaxpr, leaves: Sequence[ArrayLike | jax.ShapeDtypeStruct]
+) -> tuple[str, tuple[HostCall, ...]]:
+    """A hash of what is computed, constants included, whatever the code is called and looks like; and its host calls.
 
-    And what the program calls outside of itself, of which its text has no more than a number.
+    Of a host call the program's text has no more than a number.
     """
     text = jax.jit(jaxpr_as_fun(jaxpr)).lower(*leaves).as_text()
     found = hashlib.sha256(text.encode())
@@ -242,18 +238,18 @@ def _hash_program(jaxpr: ClosedJaxpr, leaves: list) -> tuple[str, tuple]:
     return found.hexdigest(), calls
 
 
-def _measure_name(measure: Callable) -> str:
+def _measure_name(measure: Callable[..., PyTree]) -> str:
     return getattr(_unwrap_measure(measure), "__qualname__", type(measure).__name__)
 
 
-def _unwrap_measure(measure: Any) -> Any:
+def _unwrap_measure(measure: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """The user's own function inside partials and wrappers."""
     while isinstance(measure, functools.partial):
         measure = measure.func
     return inspect.unwrap(measure) if callable(measure) else measure
 
 
-def _trace_error_text(measure: Callable, point: Any, error: TypeError) -> str:
+def _trace_error_text(measure: Callable[..., PyTree], point: Mapping[str, PyTree], error: TypeError) -> str:
     """Which line of the measure cannot be traced, and why."""
     plain = _unwrap_measure(measure)
     code = getattr(plain if hasattr(plain, "__code__") else type(plain).__call__, "__code__", None)
@@ -263,21 +259,22 @@ def _trace_error_text(measure: Callable, point: Any, error: TypeError) -> str:
     if not here:
         return f"measure: {_measure_name(measure)} cannot be called with {', '.join(point)}, one number each: {reason}"
     line = here[-1]
-    source = linecache.getline(line.filename, line.lineno).strip()
+    source = linecache.getline(line.filename, line.lineno or 0).strip()
     return (
-        f"measure: {_measure_name(measure)} cannot be traced at {line.filename}, line {line.lineno}: `{source}`. {reason} A sweep is one "
-        "compiled program for all lanes, in which a swept number has no single value: expected jnp functions, jnp.where "
-        "and lax.cond instead of Python's branches and float(), and shapes and counts that no axis changes."
+        f"measure: {_measure_name(measure)} cannot be traced at {line.filename}, line {line.lineno}: `{source}`. {reason} "
+        "A sweep is one compiled program for all lanes, in which a swept number has no single value: expected jnp functions, "
+        "jnp.where and lax.cond instead of Python's branches and float(), and shapes and counts that no axis changes."
     )
 
 
-def _count_bytes(variables: Sequence[Any]) -> int:
-    sized = [v.aval for v in variables if hasattr(v.aval, "shape")]
+def _count_bytes(variables: Iterable[Var | Literal]) -> int:
+    """Bytes of arrays; a random key's dtype has no size of its own, and counts as eight."""
+    sized = [v.aval for v in variables if isinstance(v.aval, ShapedArray)]
     return sum(math.prod(aval.shape) * getattr(aval.dtype, "itemsize", 8) for aval in sized)
 
 
 def _max_carried_bytes(jaxpr: Jaxpr) -> int:
-    """Bytes that a turn of any loop hands on, at most: what it carries, and what it stacks."""
+    """The most bytes that an iteration of any loop hands on: what it carries, and what it stacks."""
     most = 0
     for equation in jaxpr.eqns:
         bodies = list_inner_jaxprs(equation)
@@ -287,7 +284,7 @@ def _max_carried_bytes(jaxpr: Jaxpr) -> int:
 
 
 def _max_peak_bytes(jaxpr: Jaxpr) -> int:
-    """Bytes alive at a time, at most: of every operation its results, what is still to be used, and what it needs inside."""
+    """The most bytes alive at once: of every operation its results, what is still to be used, and what it needs inside."""
     last = {v: i for i, equation in enumerate(jaxpr.eqns) for v in equation.invars if not isinstance(v, Literal)}
     kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}
     alive, most = _count_bytes(jaxpr.invars), 0

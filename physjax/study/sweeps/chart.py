@@ -1,23 +1,40 @@
 """Sweeps drawn: a line over one axis, a map with contours over two, panels over three, points of a sampled design."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.contour import ContourSet
+    from matplotlib.figure import Figure
+
+    from physjax.study.sweeps.result import Sweep
+
+NamedAxis = tuple[str, np.ndarray]
+"""The label of an axis, and the numbers along it."""
+
 GOOD_COLOUR, FAILED_COLOUR = "#0072B2", "#D55E00"
-"""Good lanes and failed ones, told apart by the colour-blind too."""
+"""Good lanes and failed ones, colour-blind safe."""
 FAILED_CELL_COLOUR = "0.8"
 """Failed cells of a map."""
 MAX_CELLS = 1000
-"""Cells of a map along an axis at most; more are no longer seen."""
+"""Cells of a map along an axis at most: more than a screen has pixels are never seen."""
 MAX_PANELS = 6
-"""Panels over the first of three axes at most, evenly chosen."""
+"""Panels over the first of three axes at most, evenly spaced: each stays wide enough to be read."""
 FIGURE_WIDTH_INCHES = 7.2
-"""Of a figure [inches]."""
+"""Width of a figure [inches]: a page of text."""
 
 
-def draw_sweep(result: Any, of: str | None = None, *, labels: dict[str, str] | None = None, ax: Any = None) -> Any:
+def draw_sweep(
+    result: "Sweep",
+    of: str | None = None,
+    *,
+    labels: dict[str, str] | None = None,
+    ax: Any = None,
+) -> "Axes | Figure":
     """Draw the number `of` a `Sweep`; `labels` are words with units for axes and numbers, by their names.
 
     Returns the axes; for panels over a third axis the figure, and there `ax` is a figure to draw into.
@@ -43,13 +60,13 @@ def _choose_label(name: str, labels: dict[str, str] | None) -> str:
     return (labels or {}).get(name, name)
 
 
-def _create_axes(ax: Any) -> Any:
+def _create_axes(ax: "Axes | None") -> "Axes":
     from matplotlib import pyplot as plt
 
     return ax or plt.figure(figsize=(FIGURE_WIDTH_INCHES, 4.4), layout="constrained").add_subplot()
 
 
-def _draw_line(axis: tuple, number: np.ndarray, bad: np.ndarray, what: str, ax: Any) -> Any:
+def _draw_line(axis: NamedAxis, number: np.ndarray, bad: np.ndarray, what: str, ax: "Axes | None") -> "Axes":
     ax, (name, x) = _create_axes(ax), axis
     order = np.argsort(x, kind="stable")
     line = {"color": GOOD_COLOUR, "linewidth": 1.5, "marker": "." if x.size <= 100 else None}
@@ -64,7 +81,7 @@ def _draw_line(axis: tuple, number: np.ndarray, bad: np.ndarray, what: str, ax: 
     return ax
 
 
-def _draw_map(axes: list, number: np.ndarray, bad: np.ndarray, what: str, ax: Any) -> Any:
+def _draw_map(axes: list[NamedAxis], number: np.ndarray, bad: np.ndarray, what: str, ax: "Axes | None") -> "Axes":
     """The first axis upwards, the second to the right, a colour bar."""
     ax = _create_axes(ax)
     mesh, lines = _draw_cells(ax, axes, number, *_find_range(number))
@@ -76,8 +93,10 @@ def _draw_map(axes: list, number: np.ndarray, bad: np.ndarray, what: str, ax: An
     return ax
 
 
-def _draw_panels(axes: list, number: np.ndarray, bad: np.ndarray, what: str, figure: Any) -> Any:
-    """A map for each of some values of the first axis, all on one scale of colours."""
+def _draw_panels(
+    axes: list[NamedAxis], number: np.ndarray, bad: np.ndarray, what: str, figure: "Figure | None"
+) -> "Figure":
+    """A map for each of a few values of the first axis, all on one scale of colours."""
     from matplotlib import pyplot as plt
 
     (name, values), *others = axes
@@ -99,7 +118,9 @@ def _draw_panels(axes: list, number: np.ndarray, bad: np.ndarray, what: str, fig
     return figure
 
 
-def _draw_cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float) -> tuple[Any, Any]:
+def _draw_cells(
+    ax: "Axes", axes: list[NamedAxis], number: np.ndarray, low: float, high: float
+) -> "tuple[QuadMesh, ContourSet | None]":
     """Cells coloured by the number, with a few lines of equal number (None where there are too few cells)."""
     from matplotlib.ticker import MaxNLocator
 
@@ -116,7 +137,7 @@ def _draw_cells(ax: Any, axes: list, number: np.ndarray, low: float, high: float
     return mesh, lines
 
 
-def _draw_points(axes: list, number: np.ndarray, bad: np.ndarray, what: str, ax: Any) -> Any:
+def _draw_points(axes: list[NamedAxis], number: np.ndarray, bad: np.ndarray, what: str, ax: "Axes | None") -> "Axes":
     """Sampled points over the first two axes, coloured by the number."""
     ax, ((right, x), (up, y)) = _create_axes(ax), axes
     low, high = _find_range(number)
@@ -135,7 +156,7 @@ def _find_range(number: np.ndarray) -> tuple[float, float]:
 
 
 def _choose_scale(values: np.ndarray) -> str:
-    """Logarithmic where values grow by equal factors over more than a decade."""
+    """Logarithmic where values grow by equal factors over more than a decade; equal to 0.1 %, as rounded numbers are."""
     positive = values.size > 2 and np.all(values > 0) and values.max() > 10 * values.min()
     return (
         "log" if positive and np.ptp(np.diff(np.log(values))) < 1e-3 * abs(np.diff(np.log(values))).max() else "linear"

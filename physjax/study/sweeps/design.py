@@ -1,4 +1,4 @@
-"""What a sweep varies: named axes, crossed to a grid, zipped, or sampled; and which values belong to which lane."""
+"""What a sweep varies: named axes, crossed to a grid, zipped or sampled; and which values belong to which lane."""
 
 import hashlib
 import math
@@ -9,6 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from physjax.checks import as_positive_integer, as_real_quantity, demand_known
 
@@ -16,16 +18,19 @@ __all__ = ["Axis", "Lanes", "latin_hypercube", "sobol"]
 
 DESIGNS = ("grid", "zip")
 
+KeyPath = tuple[Any, ...]
+"""The keys that lead to a leaf of a pytree, as JAX gives them."""
+
 
 class Axis(NamedTuple):
     """A name, and values stacked along the leading axis of every array in a pytree."""
 
     name: str
-    values: Any
+    values: PyTree
 
     @property
     def length(self) -> int:
-        """How many values there are."""
+        """The number of values."""
         return len(jax.tree.leaves(self.values)[0])
 
     @property
@@ -34,7 +39,7 @@ class Axis(NamedTuple):
         leaves = jax.tree.leaves(self.values)
         return leaves[0] if len(leaves) == 1 and leaves[0].ndim == 1 else np.arange(self.length)
 
-    def at(self, index: Any) -> Any:
+    def at(self, index: int | np.integer | np.ndarray) -> PyTree:
         """The value, or the values, at an index."""
         return jax.tree.map(lambda leaf: leaf[index], self.values)
 
@@ -54,13 +59,13 @@ class Axis(NamedTuple):
         return {".".join(filter(None, ("axis", self.name, leaf_name(path)))): leaf for path, leaf in leaves}
 
 
-def leaf_name(path: tuple) -> str:
+def leaf_name(path: KeyPath) -> str:
     """The path of a leaf as a name with dots."""
     return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 class Lanes(NamedTuple):
-    """All points of a design in their order: the last axis of a grid is the fastest. Made in parts, never as a whole."""
+    """All points of a design in order: the last axis of a grid varies fastest. Made chunk by chunk, never as a whole."""
 
     axes: tuple[Axis, ...]
     design: str
@@ -73,7 +78,7 @@ class Lanes(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many points there are."""
+        """The number of points."""
         return math.prod(self.shape)
 
     @property
@@ -81,16 +86,16 @@ class Lanes(NamedTuple):
         """The arrays of all axes by name."""
         return {name: array for axis in self.axes for name, array in axis.arrays.items()}
 
-    def indices(self, lanes: Any) -> tuple:
-        """The place on each axis of lanes given by their number."""
+    def indices(self, lanes: int | np.ndarray) -> tuple[int | np.integer | np.ndarray, ...]:
+        """The index on each axis of lanes given by their number."""
         return (lanes,) * len(self.axes) if self.design == "zip" else np.unravel_index(lanes, self.shape)
 
-    def points(self, lanes: Any) -> dict[str, Any]:
+    def points(self, lanes: int | np.ndarray) -> dict[str, PyTree]:
         """The values of lanes given by their number, by axis."""
         return {axis.name: axis.at(i) for axis, i in zip(self.axes, self.indices(lanes), strict=True)}
 
 
-def build_lanes(axes: Any, design: str) -> Lanes:
+def build_lanes(axes: Mapping[str, PyTree], design: str) -> Lanes:
     """The axes as arrays of the dtypes that JAX will compute in; ValueError or TypeError in plain words for bad ones."""
     demand_known("design", design, DESIGNS)
     if not isinstance(axes, Mapping) or not axes:
@@ -99,12 +104,12 @@ def build_lanes(axes: Any, design: str) -> Lanes:
     lengths = {axis.name: axis.length for axis in lanes.axes}
     if design == "zip" and len(set(lengths.values())) > 1:
         raise ValueError(
-            f"axes: got lengths {lengths}, expected equal ones: zipped axes have a value each for every lane."
+            f"axes: got lengths {lengths}, expected equal ones: zipped axes have one value each for every lane."
         )
     return lanes
 
 
-def _build_axis(name: Any, values: Any) -> Axis:
+def _build_axis(name: str, values: PyTree) -> Axis:
     if not isinstance(name, str) or not name.isidentifier():
         raise TypeError(f"axes: got the name {name!r}, expected the name of an argument of the measure.")
     if isinstance(values, Sequence) and not hasattr(values, "_fields") and len(values):
@@ -124,15 +129,15 @@ def _build_axis(name: Any, values: Any) -> Axis:
     return Axis(name, values)
 
 
-def _check_array(name: str, leaf: Any) -> np.ndarray:
+def _check_array(name: str, leaf: ArrayLike) -> np.ndarray:
     array = np.asarray(leaf)
     if array.dtype.kind not in "biuf" and not jnp.issubdtype(array.dtype, jnp.floating):
         raise TypeError(f"axis {name}: got dtype {array.dtype}, expected real numbers, or records of them.")
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))
 
 
-def _stack_records(name: str, values: list) -> Any:
-    """Many records of the same shape, scenes for example, as one with a leading axis; others are refused with the reason."""
+def _stack_records(name: str, values: list[PyTree]) -> PyTree:
+    """Records of the same shape, scenes for example, as one with a leading axis; others are refused with the reason."""
     # what is not a number stands in the structure, where it must be the same in all
     parts = [
         eqx.partition(value, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, bool | int | float | np.generic))
@@ -167,11 +172,11 @@ def _stack_records(name: str, values: list) -> Any:
 
 
 def latin_hypercube(ranges: Mapping[str, tuple[float, float]], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
-    """Axes to be zipped: `count` points, one in each of as many equal slices of every range (low, high). Needs scipy.
+    """Axes to be zipped: `count` points, one in each of `count` equal slices of every range (low, high). Needs scipy.
 
     M. D. McKay, R. J. Beckman, W. J. Conover, Technometrics 21 (1979) 239.
     """
-    return _sample_points("LatinHypercube", ranges, count, seed)
+    return _sample_points(False, ranges, count, seed)
 
 
 def sobol(ranges: Mapping[str, tuple[float, float]], count: int, *, seed: int = 0) -> dict[str, np.ndarray]:
@@ -181,13 +186,13 @@ def sobol(ranges: Mapping[str, tuple[float, float]], count: int, *, seed: int = 
     """
     if as_positive_integer("count", count).bit_count() != 1:
         raise ValueError(
-            f"count: got {count}, expected a power of two, e.g. {1 << count.bit_length()}: only such are balanced."
+            f"count: got {count}, expected a power of two, e.g. {1 << count.bit_length()}: only such designs are balanced."
         )
-    return _sample_points("Sobol", ranges, count, seed)
+    return _sample_points(True, ranges, count, seed)
 
 
 def _sample_points(
-    kind: str, ranges: Mapping[str, tuple[float, float]], count: int, seed: int
+    balanced: bool, ranges: Mapping[str, tuple[float, float]], count: int, seed: int
 ) -> dict[str, np.ndarray]:
     try:
         from scipy.stats import qmc
@@ -198,5 +203,6 @@ def _sample_points(
     for name, end in ends.items():
         if end.shape != (2,) or not end[0] < end[1]:
             raise ValueError(f"range of {name}: got {end.tolist()}, expected (low, high) with low < high.")
-    points = getattr(qmc, kind)(len(ends), rng=np.random.default_rng(seed)).random(count)
+    sampler = qmc.Sobol if balanced else qmc.LatinHypercube
+    points = sampler(len(ends), rng=np.random.default_rng(seed)).random(count)
     return {name: low + (high - low) * points[:, i] for i, (name, (low, high)) in enumerate(ends.items())}

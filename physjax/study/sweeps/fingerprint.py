@@ -1,8 +1,8 @@
-"""What a compiled program asks of Python, and by what a function that it calls back is known in another process.
+"""What a compiled program calls on the host, and an identity for such a function that holds in another process.
 
-A program names a callback by a number alone. Its function is hashed instead: bytecode, constants, defaults, what it
-closes over and the globals it reads, and so on down. What cannot be seen to the bottom (an object's methods, a file, a
-module of the user's, a random generator) has no identity that lasts, and is refused with the reason.
+A program refers to a callback by a number alone. Its function is hashed instead: bytecode, constants, defaults, what it
+closes over and the globals it reads, recursively. What cannot be followed to the end (an object's methods, a file, a
+module of the user's, a random generator) has no lasting identity, and is refused with the reason.
 """
 
 import builtins
@@ -11,15 +11,17 @@ import functools
 import hashlib
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
 
+HostCall = tuple[str, object]
+"""The kind of a call from a compiled program to the host, and what is called."""
 _CALL_PRIMITIVES = {"pure_callback", "io_callback", "debug_callback", "debug_print", "ffi_call"}
 _LIBRARIES = {"numpy", "scipy", "jax", "jaxlib", "math", "cmath", "operator", "functools", "itertools", "builtins"}
 """Packages whose functions do the same wherever their version is the same."""
@@ -34,36 +36,36 @@ _UNREPEATABLE_WORDS = (
 )
 _PURE_BUILTINS = frozenset(_PURE_BUILTIN_WORDS.split())
 _UNREPEATABLE = frozenset(_UNREPEATABLE_WORDS.split())
-"""Names in those packages behind which there are files, generators, or what nobody can see."""
+"""Names in those packages that lead to files, random generators, or what cannot be followed."""
 
 
-def list_inner_jaxprs(equation: Any) -> list[Jaxpr]:
+def list_inner_jaxprs(equation: JaxprEqn) -> list[Jaxpr]:
     """The programs that an operation runs: bodies of loops, branches, functions."""
     found = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda p: isinstance(p, Jaxpr | ClosedJaxpr))
     return [p.jaxpr if isinstance(p, ClosedJaxpr) else p for p in found if isinstance(p, Jaxpr | ClosedJaxpr)]
 
 
-def find_host_calls(jaxpr: Jaxpr) -> list[tuple[str, Any]]:
-    """Everything that a program calls outside of itself, by kind, with the function (or what is printed, or the name)."""
+def find_host_calls(jaxpr: Jaxpr) -> list[HostCall]:
+    """Everything that a program calls on the host: its kind, with the function (or the printed format, or the name)."""
     found = []
     for equation in jaxpr.eqns:
         name, params = equation.primitive.name, equation.params
         if name in _CALL_PRIMITIVES:
             called = params.get("callback", params.get("fmt", params.get("target_name")))
-            heard = name == "pure_callback" or (name == "io_callback" and equation.outvars)
-            kind = name if heard or name == "ffi_call" else "message"
+            returns = name == "pure_callback" or (name == "io_callback" and equation.outvars)
+            kind = name if returns or name == "ffi_call" else "message"
             found.append((kind, getattr(called, "callback_func", called)))
         found += [call for body in list_inner_jaxprs(equation) for call in find_host_calls(body)]
     return found
 
 
-def persistent_digest(digest: str, calls: tuple[tuple[str, Any], ...]) -> str:
-    """The hash of a program together with the Python functions it calls back; ValueError where one cannot be known again."""
-    heard = [(kind, called) for kind, called in calls if kind != "message"]
-    if not heard:
+def persistent_digest(digest: str, calls: tuple[HostCall, ...]) -> str:
+    """The hash of a program together with the Python functions it calls back; ValueError where one has no identity."""
+    results = [(kind, called) for kind, called in calls if kind != "message"]
+    if not results:
         return digest
     found = hashlib.sha256(digest.encode())
-    for kind, called in heard:
+    for kind, called in results:
         if kind == "ffi_call":
             raise ValueError(_refusal_text(f"it calls the compiled code of {called!r} through jax.ffi"))
         if kind == "unknown":
@@ -81,7 +83,7 @@ def persistent_digest(digest: str, calls: tuple[tuple[str, Any], ...]) -> str:
 
 
 class UnknownDependency(Exception):
-    """What a function depends on, of which no identity is known that lasts."""
+    """A dependency of a function that has no lasting identity."""
 
 
 def _refusal_text(reason: str) -> str:
@@ -92,12 +94,12 @@ def _refusal_text(reason: str) -> str:
     )
 
 
-def _callable_name(called: Any) -> str:
+def _callable_name(called: object) -> str:
     return getattr(called, "__qualname__", type(called).__name__)
 
 
-def _walk_value(value: Any, seen: list) -> Iterator[bytes]:
-    """Bytes that are the same for two values only if they do the same; Unseen for what cannot be looked into."""
+def _walk_value(value: Any, seen: list[object]) -> Iterator[bytes]:
+    """Bytes that are the same for two values only if they do the same; UnknownDependency for what cannot be followed."""
     kind = type(value)
     if any(value is other for other in seen):
         yield f"again {[value is other for other in seen].index(True)}".encode()
@@ -127,12 +129,12 @@ def _walk_value(value: Any, seen: list) -> Iterator[bytes]:
         raise UnknownDependency(f"an object of type {kind.__module__}.{kind.__qualname__}")
 
 
-def _walk_values(values: Any, seen: list) -> Iterator[bytes]:
+def _walk_values(values: Iterable[object], seen: list[object]) -> Iterator[bytes]:
     for value in values:
         yield from _walk_value(value, seen)
 
 
-def _walk_array(value: Any) -> Iterator[bytes]:
+def _walk_array(value: jax.Array | np.ndarray | np.generic) -> Iterator[bytes]:
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         yield str(jax.random.key_impl(value)).encode()
         value = jax.random.key_data(value)
@@ -143,9 +145,9 @@ def _walk_array(value: Any) -> Iterator[bytes]:
     yield np.ascontiguousarray(array).tobytes()
 
 
-def _walk_collection(value: Any, seen: list) -> Iterator[bytes]:
+def _walk_collection(value: Collection[object], seen: list[object]) -> Iterator[bytes]:
     yield f"{type(value).__name__} {len(value)}".encode()
-    if isinstance(value, set | frozenset):  # in no order: each by its own hash
+    if isinstance(value, set | frozenset):  # unordered: each by its own hash
         digests = []
         for one in value:
             found = hashlib.sha256()
@@ -158,7 +160,7 @@ def _walk_collection(value: Any, seen: list) -> Iterator[bytes]:
     yield from _walk_values(value.items() if isinstance(value, dict) else value, seen)
 
 
-def _walk_function(function: types.FunctionType, seen: list) -> Iterator[bytes]:
+def _walk_function(function: types.FunctionType, seen: list[object]) -> Iterator[bytes]:
     """Code, defaults, attributes, what it closes over, and the globals that its code reads."""
     yield f"function, Python {sys.version_info[:2]}".encode()
     try:
@@ -176,7 +178,7 @@ def _walk_function(function: types.FunctionType, seen: list) -> Iterator[bytes]:
 
 
 def _find_globals(code: types.CodeType) -> set[str]:
-    """The names of a module that code and the functions in it read; Unseen for what would change one, or bring one in."""
+    """The globals that code and the functions in it read; UnknownDependency for what changes one, or imports one."""
     names = set()
     for step in dis.get_instructions(code):
         if step.opname == "IMPORT_NAME":
@@ -192,8 +194,8 @@ def _find_globals(code: types.CodeType) -> set[str]:
     return names.union(*(_find_globals(part) for part in code.co_consts if isinstance(part, types.CodeType)))
 
 
-def _walk_code(code: types.CodeType, seen: list) -> Iterator[bytes]:
-    """What is computed, without where it stands and what it is called."""
+def _walk_code(code: types.CodeType, seen: list[object]) -> Iterator[bytes]:
+    """What is computed, without its place in a file and its name."""
     yield code.co_code
     yield code.co_exceptiontable
     counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags)
@@ -202,7 +204,7 @@ def _walk_code(code: types.CodeType, seen: list) -> Iterator[bytes]:
     yield from _walk_values(code.co_consts, seen)
 
 
-def _library_name(value: Any) -> str | None:
+def _library_name(value: object) -> str | None:
     """The full name of a library's own function or type, with its version; None for anything else."""
     module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", getattr(value, "__name__", ""))
     if isinstance(value, types.BuiltinFunctionType) and isinstance(value.__self__, types.ModuleType):
@@ -226,7 +228,7 @@ def _library_name(value: Any) -> str | None:
 
 
 def _module_version(module: str) -> str:
-    """A library's module with its version; Unseen for the user's own and for those that read files or draw numbers."""
+    """A library's module with its version; UnknownDependency for a user's own, and for one that reads files or draws numbers."""
     top = module.partition(".")[0]
     if top not in _LIBRARIES or not _UNREPEATABLE.isdisjoint(module.split(".")):
         raise UnknownDependency(f"the module {module}")

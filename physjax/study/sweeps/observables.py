@@ -1,4 +1,4 @@
-"""What a run comes to, as one number with a name, and sweeps of the numbers that a scene is built from."""
+"""Named outcomes of a run, one number each, and sweeps of the numbers that a scene is built from."""
 
 import inspect
 import itertools
@@ -8,26 +8,27 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from physjax.checks import as_positive_integer, demand_known
+from physjax.scene import Scene
 from physjax.stepping.simulate import simulate
 from physjax.study.energy.quantities import total
 from physjax.study.problem import Problem
 from physjax.study.sweeps.batching import Run
-from physjax.study.sweeps.design import build_lanes
+from physjax.study.sweeps.design import Axis, build_lanes
 from physjax.study.sweeps.result import Sweep
 from physjax.study.sweeps.sweep import sweep
 from physjax.trajectory import Trajectory
 from physjax.vectors import norm
 
 OBSERVED_FRAMES = 32
-"""Moments of a run that an outcome sees."""
+"""Frames of a run that an outcome is computed from."""
 
 
 def height(flight: Trajectory) -> Float[Array, ""]:
     """Greatest height of anything on the way [m]."""
-    return jnp.max(flight.position[..., flight.scene.up])
+    return jnp.max(flight.position[..., _demand_scene(flight.scene).up])
 
 
 def distance(flight: Trajectory) -> Float[Array, ""]:
@@ -42,8 +43,16 @@ def speed(flight: Trajectory) -> Float[Array, ""]:
 
 def energy(flight: Trajectory) -> Float[Array, ""]:
     """Kinetic and potential energy of all at the end [J]."""
-    end = flight.final_scene
+    end = _demand_scene(flight.final_scene)
     return jnp.sum(total(end, flight.time[-1], end.state))
+
+
+def _demand_scene(scene: Scene | None) -> Scene:
+    if scene is None:
+        raise ValueError(
+            "this outcome needs the scene of its run, expected a run from simulate, or one loaded with scene=."
+        )
+    return scene
 
 
 OBSERVABLES = {outcome.__name__: outcome for outcome in (height, distance, speed, energy)}
@@ -53,38 +62,40 @@ OBSERVABLES = {outcome.__name__: outcome for outcome in (height, distance, speed
 class _SweptProblem(NamedTuple):
     """What differs between the lanes of a sweep over a scene's numbers."""
 
-    built: Any
+    scene: Scene
     duration: float
 
 
 def sweep_scene(
     build: Callable[..., Problem],
-    axes: Mapping[str, Any],
+    axes: Mapping[str, PyTree],
     outcome: str,
     *,
     method: Callable,
     steps: int,
     **options: Any,
 ) -> Sweep:
-    """An outcome of a scene of the gallery at every point of a grid of the numbers that it is built from.
+    """An outcome of a gallery scene at every point of a grid of the numbers that it is built from.
 
-    Each lane runs for its own scene's duration, in `steps` equal steps (at least, a multiple of 32). Every scene is built
-    before the first one runs. `options` go to `sweep`. Raises ValueError for names that are not known, and where a
+    Each lane runs for its own scene's duration, in `steps` equal steps, rounded up to a multiple of 32. Every scene is
+    built before the first one runs. `options` go to `sweep`. Raises ValueError for names that are not known, and where a
     number changes the shape of the scene.
     """
     outcome = demand_known("outcome", outcome, OBSERVABLES)
     grid = build_lanes(axes, "grid")
-    takes = inspect.signature(build).parameters
+    parameters = inspect.signature(build).parameters
     for name in axes:
-        demand_known(f"number of {build.__name__}", name, takes)
-    values = [axis.coordinate if takes[axis.name].annotation is not int else _check_counts(axis) for axis in grid.axes]
+        demand_known(f"number of {build.__name__}", name, parameters)
+    values = [
+        axis.coordinate if parameters[axis.name].annotation is not int else _check_counts(axis) for axis in grid.axes
+    ]
     built = [build(**dict(zip(axes, point, strict=True))) for point in itertools.product(*(v.tolist() for v in values))]
     flat = {axis.name: axis.at(i) for axis, i in zip(grid.axes, grid.indices(np.arange(grid.count)), strict=True)}
-    each = -(-as_positive_integer("steps", steps) // OBSERVED_FRAMES)
+    save_every = -(-as_positive_integer("steps", steps) // OBSERVED_FRAMES)
 
     def measure(scene, **_):
-        dt = scene.duration / (each * OBSERVED_FRAMES)
-        flight = simulate(scene.built, method, dt=dt, steps=each * OBSERVED_FRAMES, save_every=each)
+        dt = scene.duration / (save_every * OBSERVED_FRAMES)
+        flight = simulate(scene.scene, method, dt=dt, steps=save_every * OBSERVED_FRAMES, save_every=save_every)
         return {outcome: OBSERVABLES[outcome](flight), "run": Run(None, None, None, flight.ok)}
 
     problems = [_SweptProblem(problem.scene, problem.duration) for problem in built]
@@ -92,7 +103,7 @@ def sweep_scene(
     return replace(found, lanes=grid)
 
 
-def _check_counts(axis: Any) -> np.ndarray:
+def _check_counts(axis: Axis) -> np.ndarray:
     """The values of an axis that counts something."""
     counts = np.round(axis.coordinate).astype(int)
     if np.any(counts != axis.coordinate):

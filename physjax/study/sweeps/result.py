@@ -1,29 +1,36 @@
-"""What a sweep returns: values by axis, a status with its reason for each lane, and ways to look at, keep and pass on both."""
+"""What a sweep returns: values by axis, and a status with its reason for each lane; to be drawn, saved and exported."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from physjax.files import read_arrays, write_atomically
 from physjax.study.sweeps import store as chunks
 from physjax.study.sweeps.design import DESIGNS, Axis, Lanes, leaf_name
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from xarray import Dataset
+
 _EXPECTED_SOURCE = "one written by Sweep.save, or a sweep's folder"
 MISSING_REASON = "not computed yet"
-"""Status -1: lanes of chunks that are not there."""
+"""Status -1: lanes of missing chunks."""
 
 
 class Best(NamedTuple):
-    """The point of a sweep that is best, the measure's values there, its place in the results, and the number that decided."""
+    """The best point of a sweep, the measure's values there, its index in the results, and the number compared."""
 
-    point: dict[str, Any]
-    values: Any
+    point: dict[str, PyTree]
+    values: PyTree
     index: tuple[int, ...]
     score: float
 
@@ -37,19 +44,19 @@ class Best(NamedTuple):
 class Sweep:
     """The results of a sweep. `axes` are the swept values by name; `shape` is that of the results, an axis each.
 
-    `values` is what the measure returned, every array with `shape` in front; from a file or folder a dict by name, or the
-    array itself where it is one. `status` is 0 where a lane is good; otherwise `reasons[status]` says what went wrong there;
-    -1 is a lane that is not computed yet, whose values are zeros.
-    Results that lie in a folder are read when first asked for.
+    `values` is what the measure returned, every array with `shape` as its leading axes; from a file or folder a dict by
+    name, or the array itself where it is one. `status` is 0 where a lane is good; otherwise `reasons[status]` says what
+    went wrong there; -1 is a lane that is not computed yet, whose values are zeros.
+    Results in a folder are read when first used.
     """
 
     lanes: Lanes
     reasons: tuple[str, ...]
     source: Callable[[], dict[str, np.ndarray]] = field(repr=False)
-    rebuild: Callable[[list], Any] | None = field(default=None, repr=False)
+    rebuild: Callable[[list[np.ndarray]], PyTree] | None = field(default=None, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: the results themselves, wherever they lie now."""
+        """What is pickled: the results themselves, wherever they are kept."""
         return {"lanes": self.lanes, "reasons": self.reasons, "_flat": self._flat, "values": self.values}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -61,7 +68,7 @@ class Sweep:
         return {name: array.reshape(*self.shape, *array.shape[1:]) for name, array in found.items()}
 
     @property
-    def axes(self) -> dict[str, Any]:
+    def axes(self) -> dict[str, PyTree]:
         """The swept values by name."""
         return {axis.name: axis.values for axis in self.lanes.axes}
 
@@ -72,7 +79,7 @@ class Sweep:
 
     @property
     def status(self) -> np.ndarray:
-        """0 for a good lane, -1 for one that is not computed yet, else the place of its reason in `reasons`."""
+        """0 for a good lane, -1 for one that is not computed yet, else the index of its reason in `reasons`."""
         return self._flat["status"]
 
     @property
@@ -81,7 +88,7 @@ class Sweep:
         return self.status == 0
 
     @cached_property
-    def values(self) -> Any:
+    def values(self) -> PyTree:
         """What the measure returned."""
         arrays = self.arrays
         if self.rebuild is not None:
@@ -104,18 +111,18 @@ class Sweep:
 
     @property
     def failures(self) -> dict[str, int]:
-        """How many lanes failed, by reason."""
+        """Numbers of failed lanes, by reason."""
         codes, counts = np.unique(self.status[~self.ok], return_counts=True)
         return {
             MISSING_REASON if code < 0 else self.reasons[code]: int(n) for code, n in zip(codes, counts, strict=True)
         }
 
     def number(self, of: str | None = None) -> np.ndarray:
-        """The one number of each lane that is to be looked at, by its name where there are several."""
+        """One number of each lane, chosen by its name where there are several."""
         numbers = {
             _strip_prefix(n): a
             for n, a in self.arrays.items()
-            if a.shape == self.shape and not _strip_prefix(n).endswith("ok")
+            if a.ndim == len(self.shape) and not _strip_prefix(n).endswith("ok")
         }
         if of is None and len(numbers) == 1:
             return next(iter(numbers.values()))
@@ -136,7 +143,9 @@ class Sweep:
         values = jax.tree.map(lambda array: array[index], self.values)
         return Best(self.lanes.points(int(place)), values, tuple(map(int, index)), float(score[index]))
 
-    def plot(self, of: str | None = None, *, labels: dict[str, str] | None = None, ax: Any = None) -> Any:
+    def plot(
+        self, of: str | None = None, *, labels: dict[str, str] | None = None, ax: "Axes | Figure | None" = None
+    ) -> "Axes | Figure":
         """Draw the number `of` the values: a line over one axis, a map with contours over two, panels over three.
 
         `labels` are words for axes and numbers, with their units. Failed lanes are marked. Returns the axes, or the
@@ -150,7 +159,7 @@ class Sweep:
         """Everything by name: `axis.<name>`, `value...`, `status`, and `reasons`."""
         return self.lanes.arrays | self.arrays | {"status": self.status, "reasons": np.array(self.reasons)}
 
-    def to_xarray(self) -> Any:
+    def to_xarray(self) -> "Dataset":
         """An `xarray.Dataset` with named dimensions and coordinates. Needs xarray."""
         try:
             import xarray
@@ -169,7 +178,8 @@ class Sweep:
     def save(self, path: str | os.PathLike) -> None:
         """Write what `to_numpy` gives as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent."""
         with write_atomically(path, "wb") as file:
-            np.savez_compressed(file, **self.to_numpy(), design=np.array(self.lanes.design))
+            arrays = {**self.to_numpy(), "design": np.array(self.lanes.design)}
+            np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]  # NumPy's stubs take every keyword for allow_pickle
 
 
 def load(path: str | os.PathLike) -> Sweep:
@@ -198,7 +208,7 @@ def load(path: str | os.PathLike) -> Sweep:
 def _demand_sweep(path: Path, arrays: dict[str, np.ndarray], lanes: Lanes, flat: dict[str, np.ndarray]) -> None:
     """Raise a ValueError that names the file and the array which no sweep could have written."""
 
-    def demand(name: str, good: Any, expected: str) -> None:
+    def demand(name: str, good: ArrayLike, expected: str) -> None:
         if not np.all(good):
             shown = (
                 f"{arrays[name].dtype} of shape {arrays[name].shape}" if arrays[name].size > 4 else f"{arrays[name]}"
@@ -217,7 +227,7 @@ def _demand_sweep(path: Path, arrays: dict[str, np.ndarray], lanes: Lanes, flat:
         )
         axis = next(axis for axis in lanes.axes if name in axis.arrays)
         length = lanes.axes[0].length if lanes.design == "zip" else axis.length
-        demand(name, len(arrays[name]) == length, f"{length} values, as many as there are beside it")
+        demand(name, len(arrays[name]) == length, f"{length} values, as the other arrays of its axis have")
     for name in flat:
         shape = lanes.shape
         demand(name, arrays[name].shape[: len(shape)] == shape, f"a shape that begins with that of the axes, {shape}")
@@ -227,7 +237,7 @@ def _demand_sweep(path: Path, arrays: dict[str, np.ndarray], lanes: Lanes, flat:
     demand("status", (status >= -1) & (status < len(reasons)), f"-1 to {len(reasons) - 1}, the places of the reasons")
 
 
-def value_names(values: Any) -> list[str]:
+def value_names(values: PyTree) -> list[str]:
     """The names of a measure's numbers in files."""
     paths = [leaf_name(path) for path, _ in jax.tree_util.tree_leaves_with_path(values)]
     return [f"value.{path}" if path else "value" for path in paths]
@@ -235,7 +245,7 @@ def value_names(values: Any) -> list[str]:
 
 def _read_lanes(arrays: dict[str, np.ndarray], design: str) -> Lanes:
     """The axes of a file: records come back as dicts by name."""
-    axes: dict[str, Any] = {}
+    axes: dict[str, PyTree] = {}
     for name, array in arrays.items():
         kind, _, rest = name.partition(".")
         axis, _, part = rest.partition(".")

@@ -1,4 +1,4 @@
-"""A folder of finished chunks: each is whole or absent, knows which sweep it is of, and is checked by its own name.
+"""A folder of finished chunks: each is whole or absent, names the sweep it belongs to, and is checked by its own name.
 
 `manifest.json` says what the sweep is. `chunk-00000012-<sha256 of the file>.npz` holds lanes 12·batch and on, readable
 by `numpy.load`: an array for each number that the measure returns, `status`, and `sweep`, the manifest's identity.
@@ -16,17 +16,20 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import jax
 import numpy as np
 
+from physjax.backend import device_kind
 from physjax.files import ensure_writable_folder, write_atomically
 
 CHUNK_FILE_PATTERN = re.compile(r"chunk-(\d{8})-([0-9a-f]{64})\.npz")
 PARTIAL_FILE_PATTERN = re.compile(r"\.chunk-(\d{8})-.*")
 """What a killed process leaves of a chunk that it was writing."""
 MANIFEST = "manifest.json"
+Manifest = dict[str, Any]
+"""What a sweep is, as JSON: names, hashes, shapes, counts."""
 MISMATCH_TEXTS = {
     "axes": "other values on the axes",
     "design": "another design",
@@ -42,29 +45,33 @@ MISMATCH_TEXTS = {
 
 
 def collect_versions() -> dict[str, str]:
-    """Of the packages that decide about bits."""
+    """Versions of the packages that determine the bits of a result."""
     return {name: version(name) for name in ("jax", "jaxlib", "numpy")}
 
 
-def hash_manifest(manifest: Mapping[str, Any]) -> str:
+def hash_manifest(manifest: Manifest) -> str:
     """A hash of a manifest."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
-class Store(ABC):
+Place = TypeVar("Place")
+"""Where a chunk is: a slice of arrays, or a file."""
+
+
+class Store(ABC, Generic[Place]):
     """Where the chunks of one sweep are kept."""
 
-    def __init__(self, manifest: dict[str, Any]):
+    def __init__(self, manifest: Manifest):
         self.manifest = manifest
 
     @property
     def chunks(self) -> int:
-        """How many there will be."""
+        """The number of chunks in the end."""
         return -(-self.lanes // self.manifest["batch"])
 
     @property
     def lanes(self) -> int:
-        """How many lanes there are."""
+        """The number of lanes."""
         return math.prod(self.manifest["shape"])
 
     def range(self, chunk: int) -> tuple[int, int]:
@@ -73,18 +80,18 @@ class Store(ABC):
         return chunk * batch, min((chunk + 1) * batch, self.lanes)
 
     def allocate_arrays(self) -> dict[str, np.ndarray]:
-        """Room for all lanes, none of which is there: zeros, and a status of -1."""
+        """Arrays for all lanes, none of which is computed: zeros, and a status of -1."""
         outputs = self.manifest["outputs"].items()
         whole = {name: np.zeros((self.lanes, *shape), dtype) for name, (shape, dtype) in outputs}
         whole["status"][:] = -1
         return whole
 
     @abstractmethod
-    def find_finished(self) -> dict[int, Any]:
-        """The chunks that are there, by number, to be `read`."""
+    def find_finished(self) -> dict[int, Place]:
+        """The finished chunks by number, each to be `read`."""
 
     @abstractmethod
-    def read(self, place: Any) -> dict[str, np.ndarray]:
+    def read(self, place: Place) -> dict[str, np.ndarray]:
         """The arrays of a finished chunk."""
 
     @abstractmethod
@@ -93,22 +100,22 @@ class Store(ABC):
 
     @abstractmethod
     def gather(self) -> dict[str, np.ndarray]:
-        """All lanes; those of chunks that are not there have status -1 and zeros."""
+        """All lanes; those of missing chunks have status -1 and zeros."""
 
     @abstractmethod
     def share(self, processes: int) -> None:
         """Wait until all processes have finished, and let each have all chunks."""
 
 
-class MemoryStore(Store):
+class MemoryStore(Store[slice]):
     """Chunks as parts of whole arrays."""
 
-    def __init__(self, manifest: dict[str, Any]):
+    def __init__(self, manifest: Manifest):
         super().__init__(manifest)
         self.arrays = self.allocate_arrays()
 
     def find_finished(self) -> dict[int, slice]:
-        """None: a sweep in memory begins anew."""
+        """None: a sweep in memory starts from the beginning."""
         return {}
 
     def read(self, place: slice) -> dict[str, np.ndarray]:
@@ -129,9 +136,11 @@ class MemoryStore(Store):
         from jax.experimental.multihost_utils import process_allgather
 
         batch, most = self.manifest["batch"], -(-self.chunks // processes)
-        lanes = lambda i: np.concatenate(  # noqa: E731
-            [np.arange(*self.range(chunk)) for chunk in range(i, self.chunks, processes)] or [np.zeros(0, int)]
-        )
+
+        def lanes(process: int) -> np.ndarray:
+            ranges = [np.arange(*self.range(chunk)) for chunk in range(process, self.chunks, processes)]
+            return np.concatenate(ranges or [np.zeros(0, int)])
+
         mine = lanes(jax.process_index())
         for array in self.arrays.values():
             sent = np.zeros((most * batch, *array.shape[1:]), array.dtype)
@@ -141,10 +150,10 @@ class MemoryStore(Store):
                 array[lanes(i)] = np.ascontiguousarray(one).view(array.dtype).reshape(sent.shape)[: lanes(i).size]
 
 
-class FolderStore(Store):
+class FolderStore(Store[Path]):
     """Chunks as files."""
 
-    def __init__(self, path: Path, manifest: dict[str, Any]):
+    def __init__(self, path: Path, manifest: Manifest):
         super().__init__(manifest)
         self.path = path
 
@@ -164,7 +173,8 @@ class FolderStore(Store):
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a chunk, whole and on the disk when this returns; OSError in plain words when it cannot be."""
         content = io.BytesIO()
-        np.savez(content, **arrays, sweep=np.array(hash_manifest(self.manifest)))
+        kept = {**arrays, "sweep": np.array(hash_manifest(self.manifest))}
+        np.savez(content, **kept)  # pyright: ignore[reportArgumentType]  # NumPy's stubs take every keyword for allow_pickle
         name = f"chunk-{chunk:08d}-{hashlib.sha256(content.getbuffer()).hexdigest()}.npz"
         try:
             with write_atomically(self.path / name, "wb", durable=True) as file:
@@ -172,16 +182,17 @@ class FolderStore(Store):
         except OSError as error:
             raise OSError(
                 f"sweep: cannot write chunk {chunk} of {self.chunks} into {self.path}: {error.strerror or error}. The finished "
-                "chunks are intact: make room, and run the same sweep again to go on."
+                "chunks are intact: make room, and run the same sweep again to continue."
             ) from error
 
     def read(self, path: Path) -> dict[str, np.ndarray]:
         """The arrays of a chunk; ValueError naming a file that is damaged or of another sweep."""
         content = path.read_bytes()
-        if hashlib.sha256(content).hexdigest() != CHUNK_FILE_PATTERN.fullmatch(path.name)[2]:
+        named = CHUNK_FILE_PATTERN.fullmatch(path.name)
+        if named is None or hashlib.sha256(content).hexdigest() != named[2]:
             raise ValueError(
                 f"sweep: the chunk {path} is damaged: its content is not what was written. Delete it, and run the same sweep "
-                "again to have it computed anew."
+                "again to recompute it."
             )
         try:
             with np.load(io.BytesIO(content)) as archive:
@@ -209,7 +220,7 @@ class FolderStore(Store):
 
 @contextmanager
 def open_folder(
-    path: str | os.PathLike, manifest: dict[str, Any], shard: tuple[int, int], axes: Mapping
+    path: str | os.PathLike, manifest: Manifest, shard: tuple[int, int], axes: Mapping
 ) -> Iterator[FolderStore]:
     """The folder of a sweep, locked for one process or shard; ValueError if it is in use or holds another sweep.
 
@@ -250,8 +261,8 @@ def read_layout(path: str | os.PathLike) -> tuple[int, int] | None:
     return manifest["batch"], manifest["block"]
 
 
-def _read_or_write_manifest(path: Path, manifest: dict[str, Any], axes: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The folder's manifest, written if there is none; ValueError saying in what it differs from this one."""
+def _read_or_write_manifest(path: Path, manifest: Manifest, axes: Mapping[str, np.ndarray]) -> Manifest:
+    """The folder's manifest, written if there is none; ValueError saying how it differs from this one."""
     manifest = json.loads(json.dumps(manifest))
     if (path / MANIFEST).exists():
         old = found(path).manifest
@@ -267,17 +278,17 @@ def _read_or_write_manifest(path: Path, manifest: dict[str, Any], axes: Mapping[
         return old
     if any(path.glob("chunk-*")):
         raise ValueError(
-            f"sweep: {path} holds chunks but no {MANIFEST}, so nobody knows of what. Choose another folder."
+            f"sweep: {path} holds chunks but no {MANIFEST}, so it is unknown of which sweep. Choose another folder."
         )
     with write_atomically(path / "axes.npz", "wb", durable=True) as file:
-        np.savez(file, **axes)
+        np.savez(file, **axes)  # pyright: ignore[reportArgumentType]  # NumPy's stubs take every keyword for allow_pickle
     with write_atomically(path / MANIFEST, durable=True) as file:
         json.dump({"identity": hash_manifest(manifest), "sweep": manifest}, file, indent=1)
     return manifest
 
 
-def _describe_difference(old: Any, new: Any) -> str:
-    """In what two entries differ; long hashes are cut."""
+def _describe_difference(old: object, new: object) -> str:
+    """How two entries differ; long hashes are cut."""
     if isinstance(old, dict) and isinstance(new, dict):
         keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
         return ", ".join(f"{key}: {_describe_difference(old.get(key), new.get(key))}" for key in keys)
@@ -294,12 +305,12 @@ def _lock_file(path: Path, shared: bool, who: Path, wait: bool = False) -> Itera
             fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
             raise ValueError(
-                f"sweep: another process is at work in {who}. Wait for it, or let both share the work: shard=(0, 2) in one, "
+                f"sweep: another process is working in {who}. Wait for it, or let both share the work: shard=(0, 2) in one, "
                 "shard=(1, 2) in the other."
             ) from error
         yield
 
 
 def describe_backend() -> str:
-    """The kind of device and the precision, which decide about bits."""
-    return f"{jax.default_backend()}, x64 {'on' if jax.config.jax_enable_x64 else 'off'}"
+    """The kind of device and the precision, which determine the bits of a result."""
+    return f"{device_kind()}, x64 {'on' if jax.config.read('jax_enable_x64') else 'off'}"

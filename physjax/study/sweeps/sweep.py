@@ -1,4 +1,4 @@
-"""Parameter sweeps: a measure at every point of a design, fast, resumable, and with each failure a status of its own.
+"""Parameter sweeps: a measure at every point of a design, fast, resumable, and with a status for each failure.
 
 ```python
 def landing(speed, angle):
@@ -17,7 +17,7 @@ chunks, on all of its devices. Under Slurm, with a folder that all machines see:
 ```sh
 #!/bin/bash
 #SBATCH --nodes=8 --ntasks-per-node=1 --exclusive --time=01:00:00
-#SBATCH --requeue            # a sweep that is stopped goes on where it was
+#SBATCH --requeue            # a sweep that is stopped continues where it was
 srun python ranges.py        # jax.distributed.initialize(); sweep(landing, axes, out="/scratch/ranges")
 ```
 
@@ -25,54 +25,55 @@ Without a coordinator, as an array of jobs that know nothing of each other, `--a
 `sweep(..., out="/scratch/ranges", shard=(int(os.environ["SLURM_ARRAY_TASK_ID"]), 8))`; afterwards `sweep.load`.
 """
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from physjax.checks import as_positive_integer
 from physjax.study.sweeps import store as chunks
 from physjax.study.sweeps.batching import LaneProgram, Layout, choose_layout, compile_batch, trace_measure
 from physjax.study.sweeps.design import Lanes, build_lanes, latin_hypercube, sobol
 from physjax.study.sweeps.result import Sweep, load, value_names
-from physjax.study.sweeps.store import MemoryStore, Store
+from physjax.study.sweeps.store import Manifest, MemoryStore, Store
 from physjax.text import progress_bar
 
 BATCH_MEMORY_BYTES = 1 << 30
-"""Bytes that batches may take unless told otherwise; the results themselves come on top where they are kept in memory."""
+"""Bytes that batches may take by default; the results themselves come on top where they are kept in memory."""
 
 
 def sweep(
-    measure: Callable,
-    axes: Mapping[str, Any],
+    measure: Callable[..., PyTree],
+    axes: Mapping[str, PyTree],
     *,
     design: str = "grid",
     batch: int | None = None,
     memory: int = BATCH_MEMORY_BYTES,
-    out: Any = None,
+    out: str | os.PathLike | None = None,
     progress: bool = True,
-    devices: Sequence[Any] | None = None,
+    devices: Sequence[jax.Device] | None = None,
     shard: tuple[int, int] | None = None,
 ) -> Sweep:
-    """`measure(**point)` at every point of the axes: named arrays, crossed ("grid") or side by side ("zip").
+    """`measure(**point)` at every point of the axes: named arrays, crossed ("grid") or zipped ("zip").
 
     The measure takes one number for each axis and returns a pytree of arrays. An axis may also be a record of arrays (a
     NamedTuple, of which the measure gets one of numbers) or a list of records of the same shape, such as scenes. Sampled
     points come from `sweep.latin_hypercube` and `sweep.sobol`, to be zipped. A lane is bad where a result's own `ok`
     says so (a `Trajectory`, `solve`, a `crossing`, a dict with "ok") or where a number is not finite; it changes no bit of
-    another lane (contacts alone compute a step in other roundings while any lane of a block lies at rest on them).
+    another lane (only contacts round a step differently while any lane of a block lies at rest on them).
 
     Lanes are computed `batch` at a time, by default as many as fit `memory` [bytes], in one compiled program on all local
-    `devices`. With `out`, each batch is a file in that folder as soon as it is done, and the same call goes on where a
+    `devices`. With `out`, each batch is a file in that folder as soon as it is done, and the same call continues where a
     killed one stopped. `shard=(i, n)` does every n-th of them from the i-th, for processes that share a folder; with
     `jax.distributed` that is the default, and the processes' results are gathered, in the folder or in memory.
 
-    A folder knows a measure by its program and constants, and a `jax.pure_callback` in it by the code of its function with
-    all that this closes over and reads; with `out`, a measure that calls what cannot be looked into so is refused.
+    A folder identifies a measure by its program and constants, and a `jax.pure_callback` in it by the code of its function
+    with all that this closes over and reads; with `out`, a measure that calls what cannot be followed so is refused.
 
-    A dt at a fixed duration is swept through `state_after`; what changes shapes or counts cannot be, and is refused.
+    A dt at a fixed duration is swept through `state_after`; what changes shapes or counts cannot be swept, and is refused.
 
     Raises TypeError for a measure that cannot be traced, with its line; ValueError or TypeError for axes that are empty
     or unequal, for too little memory, and for a folder that another process is using, that holds another sweep or could
@@ -115,31 +116,32 @@ def _compute_chunks(
     lanes: Lanes,
     program: LaneProgram,
     cut: Layout,
-    devices: tuple,
+    devices: tuple[jax.Device, ...],
     shard: tuple[int, int],
     progress: bool,
 ) -> None:
-    """Compute a shard's chunks that are not there yet, one after the other."""
+    """Compute those of a shard's chunks that are missing, one after the other."""
     mine = range(shard[0], store.chunks, shard[1])
     done = {chunk for chunk, path in store.find_finished().items() if chunk in mine and store.read(path)}
     left = [chunk for chunk in mine if chunk not in done]
     count = lambda some: sum(stop - start for start, stop in map(store.range, some))  # noqa: E731
     with progress_bar(progress=progress, total=count(mine), initial=count(done), unit="lane", unit_scale=True) as shown:
-        run = compile_batch(program, cut, devices) if left else None
         for chunk in left:
             start, stop = store.range(chunk)
-            # the last batch is filled up with its last lane, so that there is one shape and one program
+            # the last batch is padded with its last lane: one shape is one compiled program
             inside = np.minimum(np.arange(start, start + cut.count * cut.size), stop - 1)
+            # compiled once and cached; not at all where every chunk is there
+            compute = compile_batch(program, cut, devices)
             points = [
                 leaf.reshape(cut.count, cut.size, *leaf.shape[1:]) for leaf in jax.tree.leaves(lanes.points(inside))
             ]
-            found = [np.asarray(leaf).reshape(-1, *leaf.shape[2:])[: stop - start] for leaf in run(*points)]
+            found = [np.asarray(leaf).reshape(-1, *leaf.shape[2:])[: stop - start] for leaf in compute(*points)]
             store.write(chunk, dict(zip(store.manifest["outputs"], found, strict=True)))
             shown.update(stop - start)
 
 
-def _build_manifest(lanes: Lanes, program: LaneProgram, cut: Layout, digest: str) -> dict[str, Any]:
-    """What the sweep is, down to what decides about bits."""
+def _build_manifest(lanes: Lanes, program: LaneProgram, cut: Layout, digest: str) -> Manifest:
+    """What the sweep is, down to everything that determines its bits."""
     outputs = jax.tree.leaves(program.values)
     names = value_names(program.values)
     return {
@@ -159,13 +161,13 @@ def _build_manifest(lanes: Lanes, program: LaneProgram, cut: Layout, digest: str
     }
 
 
-def _build_abstract_point(lanes: Lanes) -> dict[str, Any]:
+def _build_abstract_point(lanes: Lanes) -> dict[str, PyTree]:
     """A point of the design as shapes and dtypes."""
     one = lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype)  # noqa: E731
     return {axis.name: jax.tree.map(one, axis.values) for axis in lanes.axes}
 
 
-def _check_devices(devices: Sequence[Any] | None) -> tuple:
+def _check_devices(devices: Sequence[jax.Device] | None) -> tuple[jax.Device, ...]:
     devices = tuple(jax.local_devices() if devices is None else devices)
     if not devices or not all(device in jax.local_devices() for device in devices):
         raise ValueError(f"devices: got {devices}, expected some of jax.local_devices(): {jax.local_devices()}.")

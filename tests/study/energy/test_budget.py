@@ -7,6 +7,7 @@ import pytest
 
 from physjax import Particles, Scene, contacts, energy, forces, inertia, lattices, methods, rigid, simulate, springs
 from physjax.pins import Pins
+from physjax.scene import free_motion
 from physjax.scenes import SCENES
 
 CLOSED = 1e-9
@@ -186,3 +187,26 @@ def test_bad_input_is_told_in_plain_words(unannotated):
         energy.ledger(flight)
     with pytest.raises(ValueError, match="got a scene with an emitter"):
         energy.ledger(simulate(SCENES["sparks"]().scene, methods.verlet, dt=0.01, steps=2))
+
+
+def test_a_projecting_contact_is_resolved_before_the_prescribed_nodes_return_to_their_path():
+    # euler cuts the valley of the path, below the floor that the path itself never passes
+    valley = lambda t: jnp.stack([jnp.stack([3.0 * t, 0.001 + (t - 0.5) ** 2]), jnp.stack([1.0 + 0 * t, 2.0 + 0 * t])])  # noqa: E731
+    nodes = np.array([True, False])
+    floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.project)
+    start = Particles(valley(0.0), jnp.asarray([[3.0, -1.0], [0.0, -2.0]]))
+    tow = springs.Springs([[0, 1]], 4.0, 1.0, 0.1)
+    scene = Scene(start, 0.5, (forces.Gravity(), tow), (floor,), pinned=Pins(nodes, valley))
+    run = simulate(scene, methods.euler, dt=0.1, steps=10)
+    ledger = energy.ledger(run)
+    closes(ledger)
+    received, work = np.zeros(2), 0.0
+    for i in range(10):
+        now, t = run.scene.replace(state=Particles(*(leaf[i] for leaf in run.state))), 0.1 * i
+        moved = free_motion(methods.euler, now, t, 0.1)
+        after = floor.resolve(t + 0.1, moved.state, scene.mass)
+        received -= np.sum(0.5 * (after.velocity - moved.state.velocity), axis=0)
+        work -= energy.total(now, t + 0.1, after) - energy.total(now, t + 0.1, moved.state)
+    assert abs(received[1]) > 0.1
+    np.testing.assert_allclose(ledger.momentum.totals["Plane"], received, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ledger.energy.totals["Plane"], work, rtol=1e-9)

@@ -199,12 +199,12 @@ def test_a_folder_in_use_is_refused_unless_both_share(tmp_path):
     manifest = store.found(tmp_path).manifest
     with (
         store.open_folder(tmp_path, manifest, (0, 1), {}),
-        pytest.raises(ValueError, match="another process is at work"),
+        pytest.raises(ValueError, match="another process is working"),
     ):
         quiet(product, AXES, out=tmp_path, shard=(1, 2))
     with store.open_folder(tmp_path, manifest, (0, 2), {}):
         for shard in (None, (0, 2)):
-            with pytest.raises(ValueError, match=r"another process is at work.*shard="):
+            with pytest.raises(ValueError, match=r"another process is working.*shard="):
                 quiet(product, AXES, out=tmp_path, shard=shard)
         assert quiet(product, AXES, out=tmp_path, shard=(1, 2)).ok.all()
 
