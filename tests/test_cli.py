@@ -48,7 +48,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path, ca
     assert "method" not in captured.err  # no progress bar was begun
 
 
-def test_scenes_tells_what_a_scene_is_how_large_and_by_what_it_is_known(capsys):
+def test_scenes_lists_what_a_scene_is_its_size_and_its_truth(capsys):
     assert main(["scenes", "--only", "kepler", "hanging_rope"]) == 0
     printed = capsys.readouterr().out
     assert "kepler: 2 " in printed
@@ -125,7 +125,7 @@ def test_sweep_goes_over_the_numbers_of_a_scene_and_draws(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("over", "outcome", "told"),
+    ("over", "outcome", "words"),
     [
         ("nodes=5:7:3", "height", "differ in more than numbers"),
         ("nodes=5:6:3", "height", "expected whole numbers: it counts something"),
@@ -134,7 +134,7 @@ def test_sweep_goes_over_the_numbers_of_a_scene_and_draws(tmp_path, capsys):
         ("mass=1:2:3", "hight", "Did you mean height"),
     ],
 )
-def test_sweep_refuses_in_plain_words(tmp_path, capsys, over, outcome, told):
+def test_sweep_refuses_in_plain_words(tmp_path, capsys, over, outcome, words):
     command = ["sweep", "hanging_rope", "--over", over, "--outcome", outcome, "--out", str(tmp_path)]
     assert main(command) == 2
-    assert told in capsys.readouterr().err
+    assert words in capsys.readouterr().err

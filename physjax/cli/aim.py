@@ -85,7 +85,7 @@ def _build_throw(options: argparse.Namespace) -> "Scene":
     start = jnp.array(options.start or [0.0] * dim)
     for name, given in (("start", start), ("wind", options.wind)):
         if given is not None and len(given) != dim:
-            raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
+            raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, one for each of --target.")
     if options.wind is not None and options.drag is None:
         raise ValueError("--wind: got a wind without --drag, expected both: the air acts through the drag.")
     if options.up == "z" and dim == 2:

@@ -77,7 +77,7 @@ def _draw_paths(film: Trajectory) -> "Figure":
     scenery.draw_obstacles(ax, 0)
     scenery.draw_solids(ax, 0)
     plot.paths(film, every=_lane_stride(film), ax=ax)
-    # drawing paths sets the limits anew: back to those of the stage
+    # drawing paths moves the limits: back to those of the stage
     ax.set(**{f"{name}lim": ends for name, *ends in zip("xyz", *scenery.stage, strict=False)})
     if scenery.flat:
         ax.set_aspect("equal", adjustable="box")

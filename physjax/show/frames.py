@@ -118,7 +118,7 @@ def pick_frames(who: str, run: Frames, frames: int | Iterable[int] | None, defau
         if frame % count >= run.good_frames:
             raise ValueError(
                 f"{who}: got frame {frame}, t = {run.time[frame]:g} s, where the run has blown up; expected at most "
-                f"{run.good_frames - 1}, the last good one. film.first_bad_step tells when it happened; try a smaller dt."
+                f"{run.good_frames - 1}, the last good one. film.first_bad_step says when it happened; try a smaller dt."
             )
     return [int(frame) % count for frame in asked]
 

@@ -3,7 +3,7 @@
 Everything here asks a contact for `signed_distance(t, position)` and for nothing else, so that a shape written by a user
 is drawn like one of ours. In the plane matplotlib draws the contour; in space `extract_level_set` makes its polygons by
 surface nets (Gibson, "Constrained elastic surface nets", 1998): one vertex in each cell that the surface passes, one
-quadrilateral around each edge of the grid that it cuts. Details smaller than a cell are lost.
+quadrilateral around each edge of the grid that it cuts. Details smaller than a cell are not drawn.
 """
 
 from collections.abc import Sequence

@@ -41,7 +41,7 @@ class Solid(NamedTuple):
 
 
 def select_shared_surfaces(contacts: tuple[Contact, ...], dim: int = 3) -> tuple[Contact, ...]:
-    """The surfaces that are the same for all lanes; of what bodies touch with contact points, the surface."""
+    """The surfaces that are the same for all lanes; of a contact of bodies with a surface, the surface."""
     surfaces = (contact.surface if isinstance(contact, SurfaceContact) else contact for contact in contacts)
     return tuple(surface for surface in surfaces if level_sets.is_shared(surface, dim))
 
@@ -87,7 +87,9 @@ def draw_in_space(ax: "Axes3D", stage: Stage, contacts: tuple[Contact, ...], t: 
         if outline.solid or not len(outline.polygons):
             continue
         if outline.normals is None:
-            glass = SHEET_OPACITY / math.sqrt(len(outline.polygons))  # as many as stand behind each other
+            glass = SHEET_OPACITY / math.sqrt(
+                len(outline.polygons)
+            )  # several sheets behind each other are as dark as one
             look = {"facecolors": (GREY, glass), "edgecolors": (GREY, 0.6), "linewidths": 0.8}
             polygons = outline.polygons
         else:

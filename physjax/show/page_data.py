@@ -1,4 +1,4 @@
-"""What the page of `animate.view` is told: positions as 16-bit whole numbers, and the surfaces of the scene."""
+"""What the page of `animate.view` is made from: positions as 16-bit whole numbers, and the surfaces of the scene."""
 
 import base64
 import zlib

@@ -39,16 +39,16 @@ def gallery(monkeypatch):
     monkeypatch.setattr("physjax.study.problem.FILM_FRAMES", 16)
 
 
-def test_a_scene_is_told_with_its_size_and_its_truths():
-    told, _ = describe_scene("balls_in_a_box")
-    assert told.size == "64 particles in 2-D, 2 s"
-    assert told.truth.startswith("closed form; every |velocity component| is what it was")
-    told, _ = describe_scene("heavy_top")
-    assert told.size == "2 bodies in 3-D, 1.96 s"
-    told, _ = describe_scene("hanging_rope")
-    assert told.size == "25 particles in 2-D, 24 springs, 4 s"
-    assert "catenary" in str(told)
-    assert max(map(len, str(told).splitlines())) <= 110
+def test_a_scene_is_listed_with_its_size_and_its_truths():
+    entry, _ = describe_scene("balls_in_a_box")
+    assert entry.size == "64 particles in 2-D, 2 s"
+    assert entry.truth.startswith("closed form; every |velocity component| is what it was")
+    entry, _ = describe_scene("heavy_top")
+    assert entry.size == "2 bodies in 3-D, 1.96 s"
+    entry, _ = describe_scene("hanging_rope")
+    assert entry.size == "25 particles in 2-D, 24 springs, 4 s"
+    assert "catenary" in str(entry)
+    assert max(map(len, str(entry).splitlines())) <= 110
 
 
 @pytest.mark.slow
@@ -56,9 +56,9 @@ def test_a_scene_is_told_with_its_size_and_its_truths():
 def test_every_scene_is_drawn_and_one_that_fails_is_named_at_the_end(tmp_path, capsys):
     folder = tmp_path / "gallery"
     assert main(["scenes", "--render", str(folder)]) == 1
-    told = capsys.readouterr()
-    assert told.err.splitlines()[-1] == "physjax: ruin could not be drawn: RuntimeError: no such bridge"
-    assert "3/3" in told.err
+    printed = capsys.readouterr()
+    assert printed.err.splitlines()[-1] == "physjax: ruin could not be drawn: RuntimeError: no such bridge"
+    assert "3/3" in printed.err
     expected = {"fall.png", "fall.gif", "swing.png", "swing.gif", "index.html"}
     assert {file.name for file in folder.iterdir()} == expected
     page = (folder / "index.html").read_text(encoding="utf-8")

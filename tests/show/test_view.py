@@ -34,7 +34,7 @@ def positions(film):
     return np.where(whole[..., :1] == HIDDEN_CODE, np.nan, place), (high - low) / 2 / QUANTISATION_STEPS
 
 
-def test_a_cloth_is_told_to_the_last_step_of_sixteen_bits(drape):
+def test_a_cloth_is_sent_to_the_last_step_of_sixteen_bits(drape):
     run, sheet = drape
     view = animate.view(run, sheet)
     film = content(view)
