@@ -1,16 +1,17 @@
-"""What adaptive steps buy, and what they cost methods that owe their virtue to equal ones.
+"""What adaptive steps gain, and what they cost methods whose bounded energy depends on equal ones.
 
     python benchmarks/adaptive.py [--quick] [--out DIR]
 
 Two bodies on ellipses, float64. (a) Eccentricity 0.9, two orbits: error at the end against evaluations of the force, for
-Runge-Kutta with equal steps and methods under error control; (b) tries that were rejected; (c) eccentricity 0.6, many
-orbits: the energy under leapfrog, verlet and Runge-Kutta, with equal steps and, at as many evaluations, with steps that
-follow an error. Counts, not seconds, so the machine does not matter.
+Runge-Kutta with equal steps and methods under error control; (b) rejected steps; (c) eccentricity 0.6, many
+orbits: the energy under leapfrog, verlet and Runge-Kutta, with equal steps and, for the same number of evaluations,
+with error control. Counts, not seconds, so the machine does not matter.
 """
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import harness
 import jax
@@ -20,14 +21,15 @@ from harness import Bar, print_progress
 from physjax import energy, methods, simulate
 from physjax.files import write_atomically
 from physjax.scenes import SCENES
+from physjax.study.problem import Problem
 
 ERROR_GOAL = 1e-6
 COLOURS = {"rk4": "#009E73", "verlet": "#0072B2", "leapfrog": "#CC79A7", "euler": "#D55E00"}
 SYMPLECTIC = ("leapfrog", "verlet")
 FRAMES_PER_ORBIT = 20
-"""Moments of an orbit at which the energy is looked at."""
-STEPS_PER_TRY = 3
-"""A try is a step whole and in halves."""
+"""Times per orbit at which the energy is recorded."""
+STEPS_PER_ATTEMPT = 3
+"""An attempt is a step taken whole and in two halves."""
 
 
 class Settings(NamedTuple):
@@ -43,20 +45,20 @@ FULL = Settings(tuple(10.0**-i for i in range(3, 12)), tuple(500 * 2**i for i in
 QUICK = Settings((1e-4, 1e-6, 1e-10), (500, 8000, 32_000), 10, 800)
 
 
-def measure_error(problem: Any, method: Callable, steps: int) -> float:
+def measure_error(problem: Problem, method: Callable, steps: int) -> float:
     """Error of position after the whole duration [m]."""
     run = simulate(problem.scene, method, dt=problem.duration / steps, steps=steps, save_every=steps)
     exact = problem.exact(np.array([problem.duration])).position[0]
     return float(np.abs(np.asarray(run.position[-1]) - exact).max())
 
 
-def measure_adaptive(problem: Any, method: Callable, tolerance: float, frames: int = 4) -> dict:
+def measure_adaptive(problem: Problem, method: Callable, tolerance: float, frames: int = 4) -> dict:
     """Error, evaluations and rejections of a run under error control."""
     chooser = methods.adaptive(method, tolerance, tolerance)
     counted = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
     tries, rejected = int((counted.accepted + counted.rejected).sum()), int(counted.rejected.sum())
     exact = problem.exact(np.array([problem.duration])).position[0]
-    evaluations = STEPS_PER_TRY * method.promises.evaluations * tries + 2 * frames
+    evaluations = STEPS_PER_ATTEMPT * method.promises.evaluations * tries + 2 * frames
     error = float(np.abs(np.asarray(counted.state.position[-1]) - exact).max())
     row = {"method": f"adaptive {method.__name__}", "tolerance": tolerance, "error": error, "evaluations": evaluations}
     return row | {"tries": tries, "rejected": rejected}
@@ -69,7 +71,7 @@ def measure_work_and_error(size: Settings) -> list[dict]:
         evaluations = steps * methods.rk4.promises.evaluations
         rows.append({"method": "rk4", "error": measure_error(problem, methods.rk4, steps), "evaluations": evaluations})
     for method in (methods.rk4, methods.verlet):
-        # an order of two needs a great many steps for the finest
+        # second order needs very many steps for the finest tolerances
         rows += [measure_adaptive(problem, method, t) for t in size.tolerances if method is methods.rk4 or t >= 1e-8]
     return rows
 
@@ -84,7 +86,7 @@ def interpolate_evaluations(rows: list[dict], name: str) -> float:
 
 
 def compare_energies(size: Settings) -> dict[str, dict[str, np.ndarray]]:
-    """Relative change of the energy over many orbits, equal steps beside steps that follow an error."""
+    """Relative change of the energy over many orbits, equal steps and steps under error control."""
     problem = SCENES["kepler"](eccentricity=0.6, orbits=size.orbits)
     start = float(energy.total(problem.scene, 0.0, problem.scene.state))
     found = {}
@@ -99,30 +101,30 @@ def compare_energies(size: Settings) -> dict[str, dict[str, np.ndarray]]:
         )
         follows = simulate(problem.scene, chooser, dt=problem.duration / frames, steps=frames, record=change)
         found[method.__name__] = {"equal": np.asarray(equal.recorded)[1:], "adaptive": np.asarray(follows.recorded)[1:]}
-        print_progress(f"  {method.__name__}: {steps} equal steps beside {spent} evaluations under error control")
+        print_progress(f"  {method.__name__}: {steps} equal steps, {spent} evaluations under error control")
     return found
 
 
-def match_cost(problem: Any, method: Callable, size: Settings) -> tuple[Any, int]:
-    """The method under error control with the tolerance that makes it cost nearly so many evaluations."""
+def match_cost(problem: Problem, method: Callable, size: Settings) -> tuple[Callable, int]:
+    """The method under error control with the tolerance at which it costs about as many evaluations as equal steps."""
     low, high = -12.0, -2.0
     goal, frames = size.orbits * size.per_orbit, size.orbits * FRAMES_PER_ORBIT
     for _ in range(10):
         middle = (low + high) / 2
         chooser = methods.adaptive(method, 10.0**middle, 10.0**middle)
         counted = methods.count_steps(problem.scene, chooser, dt=problem.duration / frames, steps=frames)
-        spent = STEPS_PER_TRY * method.promises.evaluations * int((counted.accepted + counted.rejected).sum())
+        spent = STEPS_PER_ATTEMPT * method.promises.evaluations * int((counted.accepted + counted.rejected).sum())
         low, high = (middle, high) if spent > goal or not counted.ok.all() else (low, middle)
     return chooser, spent
 
 
 def drift(change: np.ndarray) -> float:
-    """By how much the mean energy of the last tenth of a run differs from that of its first: 0 if it only swings."""
+    """By how much the mean energy of the last tenth of a run differs from that of its first: 0 if it only oscillates."""
     parts = np.array_split(change, 10)
     return float(abs(parts[-1].mean() - parts[0].mean()))
 
 
-def draw(path: Any, rows: list[dict], found: dict, size: Settings, foot: str) -> None:
+def draw(path: Path, rows: list[dict], found: dict, size: Settings, foot: str) -> None:
     """Error against evaluations, and energy over orbits."""
     from matplotlib.figure import Figure
 

@@ -1,19 +1,19 @@
-"""Does the advisor keep its promises, is what it recommends the fastest, and how does that compare with diffrax?
+"""Does `recommend` meet the errors it promises, is its choice the fastest, and how does that compare with diffrax?
 
     python benchmarks/advisor.py --part promises --scenes kepler random:0 random:1
     python benchmarks/advisor.py --part rivals
     python benchmarks/advisor.py --part report
 
-Each scene is written as soon as it is done, and what is written is not done again, so that a run can be broken off and
-resumed; `--limit` seconds end it by themselves. `--part report` judges and draws what there is.
+Each scene is written as soon as it is done, and what is written is not run again, so that a run can be interrupted and
+resumed; `--limit` seconds end it. `--part report` judges and draws what there is.
 
 Promises: on every scene of the gallery and 40 random ones, one search serves three errors; each recommended run is made
-by `.simulate()` and judged by another truth than the search's (a closed form; our own rk4 where the search had diffrax;
-verlet where it had our rk4), and timed in turn with the fastest run of an exhaustive search, steps √2 apart: of every
-method of the registry and adaptive rk4 on smooth scenes; of what the search would try first where there are contacts,
-which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ by a percent; diffrax's solvers
-under vmap, each at the loosest of its tolerances, a power of ten apart, that keeps the error (Kvaerno5 only on small
-scenes; a tenth or twentieth of the duration where a run would take minutes).
+by `.simulate()` and judged by a reference solution other than the search's (a closed form; our own rk4 where the search
+had diffrax; verlet where it had our rk4), and timed in turn with the fastest run of an exhaustive search, steps √2
+apart: of every method of the registry and adaptive rk4 on smooth scenes; of what the search would try first where there
+are contacts, which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ by a percent;
+diffrax's solvers under vmap, each at the loosest of its tolerances, a power of ten apart, that meets the error (Kvaerno5
+only on small scenes; a tenth or twentieth of the duration where a run would take minutes).
 """
 
 import json
@@ -63,7 +63,7 @@ def build_problem(name):
 
 
 def check_promises(name):
-    """One search for three errors, its promises checked, its runs against the fastest of an exhaustive search."""
+    """One search for three errors, its errors checked, its runs against the fastest of an exhaustive search."""
     problem = build_problem(name)
     started, busy = time.perf_counter(), time.process_time()
     answers = recommend(problem.scene, error=ERRORS, horizon=problem.duration, frames=problem.frames, progress=False)
@@ -102,7 +102,7 @@ def search_exhaustively(problem, answers):
 
 
 def judge_promise(problem, other, truth_error, advice, runs):
-    """A promise, kept or not, and its time beside that of the fastest run that keeps the same error."""
+    """A promised error, met or not, and the run's time relative to the fastest run that meets the same error."""
     row = {"error": advice.error, "ok": advice.ok, "reason": advice.reason, "evidence": advice.evidence}
     if not advice.ok:
         return row
@@ -114,7 +114,7 @@ def judge_promise(problem, other, truth_error, advice, runs):
     if good:
         mine = compile_run(problem, best.method, best.dtype)
         fineness = 1 / best.tolerance if best.tolerance else float(best.steps_per_frame)
-        # the few that look fastest take turns: a single look may have met a quiet moment
+        # the few that look fastest are timed in turn: a single timing may have met a quiet moment
         few = sorted(good, key=lambda pair: pair[1].seconds)[:3]
         turns = [(mine, good[0][1]._replace(fineness=fineness)), *few]
         own, *others = time_in_turn([(entry, trial._replace(seconds=np.inf)) for entry, trial in turns])
@@ -125,7 +125,7 @@ def judge_promise(problem, other, truth_error, advice, runs):
 
 
 def perturb_copies(scene, count):
-    """So many of a scene, their velocities (of bodies, momenta) changed by a percent at random."""
+    """`count` copies of a scene, their velocities (of bodies, momenta) changed by a percent at random."""
     rng = np.random.default_rng(0)
     many = stack_copies(scene, count)
     noise = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * jnp.abs(leaf), many.state)
@@ -133,7 +133,7 @@ def perturb_copies(scene, count):
 
 
 def compare_rivals(name):
-    """A thousand copies: the recommended run beside diffrax's solvers at equal errors."""
+    """A thousand copies: the recommended run and diffrax's solvers at equal errors."""
     problem = build_problem(name)
     with jax.enable_x64(True):
         single = cast_floats(problem.scene, jnp.float64)
@@ -141,7 +141,7 @@ def compare_rivals(name):
         many = problem._replace(scene=perturb_copies(single, BATCH), duration=duration, exact=None)
         asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
         answers = recommend(many.scene, seconds=120, progress=False, **asked)
-        # another truth than the search's, where that is diffrax's
+        # a reference other than the search's, where that is diffrax's
         truth = solve_reference(many, wanted=1e-7, seconds=60.0, own=methods.rk4)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(single.state))
         solvers = SOLVERS if numbers <= KVAERNO_STATE_LIMIT else SOLVERS[:-1]
@@ -165,7 +165,7 @@ def compare_rivals(name):
 
 @partial(jax.jit, static_argnames=("solver", "frames"))
 def solve_copies(scene, states, end, tol, size, solver, frames):
-    """Every copy by itself, with steps of its own."""
+    """Every copy solved separately, with its own steps."""
     import diffrax
 
     controller = diffrax.PIDController(rtol=tol, atol=tol * size)
@@ -203,7 +203,7 @@ def time_rival(single, many, truth, solver):
         if seconds < SLOW_RUN_SECONDS:
             seconds = min(seconds, *(harness.time_call(run) for _ in range(2)))
         if not np.isfinite(error):
-            continue  # too loose to hold, and out of steps: a tighter one may hold, and be faster
+            continue  # too loose to converge within the steps: a tighter tolerance may, and be faster
         runs.append({"solver": solver, "tolerance": tol, "error": error, "seconds": seconds})
         if seconds > SLOW_RUN_SECONDS or error < min(ERRORS):
             break
@@ -250,13 +250,11 @@ def report(record, folder, quick):
     ]
     harness.print_table(f"{BATCH} copies", ["", "ours", "[s]", "diffrax", "[s]", "times faster"], rows)
     stopped = [f"{label(n, r)}: {r['reason']}" for n, r in answers if not r["ok"]]
-    print("\nNothing keeps the error:", *(stopped or ["-"]), sep="\n  ")
+    print("\nNothing meets the error:", *(stopped or ["-"]), sep="\n  ")
     scenes, smooth = len(SCENES) + RANDOM_SCENES, sum(build_problem(name).is_ode for name in SCENES)
     whole = [len(searches) == scenes] * 3 + [len(record["rivals"]) == smooth]
-    done = f"{len(searches)} of {scenes} scenes, {len(record['rivals'])} of {smooth} beside diffrax"
-    print(
-        f"\nDone so far: {done}. {'' if all(whole) else 'A part proves nothing of the whole: its bars are not judged.'}"
-    )
+    done = f"{len(searches)} of {scenes} scenes, {len(record['rivals'])} of {smooth} against diffrax"
+    print(f"\nDone so far: {done}. {'' if all(whole) else 'Bars of incomplete parts are not judged.'}")
     for judged in (True, False):
         if some := [bar for bar, all_ in zip(bars, whole, strict=True) if all_ == judged]:
             harness.print_bars(some, quick or not judged)
@@ -275,7 +273,7 @@ def label_scene(name):
 
 
 def draw(path, kept, against, silent, foot):
-    """Promises against what was found; times beside the fastest; times beside diffrax."""
+    """Promised against measured errors; times relative to the fastest; times relative to diffrax."""
     from matplotlib.figure import Figure
 
     from physjax.files import write_atomically
@@ -295,10 +293,10 @@ def draw(path, kept, against, silent, foot):
     for line, ax in ((1.0, promise), (ALLOWED_TIME_RATIO, ratio)):
         ax.axhline(line, color="0.3", linestyle="--", linewidth=1)
     rival.axvline(1.0, color="0.3", linestyle="--", linewidth=1)
-    promise.set(xlabel="error promised [asked for]", ylabel="error by another truth [asked for]", xscale="log")
-    promise.set_title("promises: on or below the line is kept")
+    promise.set(xlabel="error promised [asked for]", ylabel="error by another reference [asked for]", xscale="log")
+    promise.set_title("promises: met on or below the line")
     ratio.set(xlabel="share of answers", ylabel="time [that of the fastest]", xlim=(0, 1))
-    ratio.set_title("beside an exhaustive search")
+    ratio.set_title("against an exhaustive search")
     rival.set(xlabel=f"time of diffrax's best [ours], {BATCH} copies", xscale="log")
     rival.set_yticks(range(len(names)), [label_scene(name) for name in names], fontsize=8)
     rival.plot(
@@ -316,11 +314,11 @@ def draw(path, kept, against, silent, foot):
 
 
 def main():
-    """Do what is not done yet, scene by scene, until the limit; then report."""
+    """Run what is not done yet, scene by scene, until the limit; then report."""
     parser = harness.build_parser(__doc__)
     parser.add_argument("--part", choices=("promises", "rivals", "report"), default="report")
     parser.add_argument("--scenes", nargs="*", help="names of the gallery, random:SEED; all by default")
-    parser.add_argument("--limit", type=float, default=480.0, help="seconds after which no scene is begun")
+    parser.add_argument("--limit", type=float, default=480.0, help="seconds after which no scene is started")
     given = harness.parse_arguments(parser)
     path = harness.result_path(given.out, "advisor", given.quick, "json")
     record = json.loads(path.read_text()) if path.exists() else {"benchmark": "advisor", "promises": {}, "rivals": {}}

@@ -2,17 +2,17 @@
 
     python benchmarks/aim.py [--quick] [--out DIR]
 
-A baseball at 40 m/s under gravity, quadratic drag and wind, in float64; every target is where a shot in this wind comes
-by on its way down, so that all are in reach. `aim_at` finds both arcs, start values included. `solve`, which is
-optimistix, is vmapped over angle and flight time together, for the low arc of the first thousand. The rival asks in the
+A baseball at 40 m/s under gravity, quadratic drag and wind, in float64; every target is where a shot in this wind passes
+on its way down, so that all are in reach. `aim_at` finds both arcs, start values included. `solve`, which is
+optimistix, is vmapped over angle and flight time together, for the low arc of the first thousand. The competitor works in the
 usual way: diffrax (Tsit5, adaptive) flies until an event, when the ball falls through the target's height; optimistix's
 Newton looks for the angle alone that makes the range right, for the low arc. Both are given the vacuum's angle and time
-to start from. What each has found is flown anew through diffrax at a tolerance of 1e-11; the misses are in the table.
+to start from. What each has found is checked through diffrax at a tolerance of 1e-11; the misses are in the table.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import harness
@@ -60,7 +60,7 @@ def direction(angle: jax.Array) -> jax.Array:
 
 
 def build_problem(count: int) -> Problem:
-    """Targets on the way down of shots at random angles, each in a wind of its own."""
+    """Targets on the way down of shots at random angles, each with its own wind."""
     rng = np.random.default_rng(0)
     wind = jnp.asarray(rng.normal(scale=3.0, size=(count, 2)) * (1.0, 0.3))
     angle = jnp.asarray(rng.uniform(0.15, 1.3, count))
@@ -164,8 +164,8 @@ CONTENDERS = {
 }
 
 
-def judge_hits(name: str, given: Problem, found: Any) -> list[Any]:
-    """Name, share that hit, worst and median miss of those that were said to [m]."""
+def judge_hits(name: str, given: Problem, found: tuple) -> list[str | float]:
+    """Name, share that hit, worst and median miss of those reported as hits [m]."""
     angles, times, ok = found
     arcs = zip(angles, times, strict=True) if name.startswith("aim_at") else [(angles, times)]
     miss = np.max([np.asarray(measure_miss(given, angle, time)) for angle, time in arcs], axis=0)
@@ -202,7 +202,7 @@ def main() -> None:
     print(harness.format_caption(about))
     harness.print_rates(f"{size.targets:,} targets", "targets a second", rows, "aim_at, both arcs")
     head = ["", f"hit to {HIT_DISTANCE:g} m", "said to hit", "median miss [m]", "worst miss [m]"]
-    harness.print_table("What was found, flown anew through diffrax; misses of those said to hit", head, accuracy)
+    harness.print_table("Solutions checked through diffrax; misses of those reported as hits", head, accuracy)
     harness.print_bars(bars, quick)
     record = {"benchmark": "aim", "quick": quick, "machine": about, "settings": size._asdict(), "runs": rows}
     record["accuracy"] = [dict(zip(("name", *head[1:]), line, strict=True)) for line in accuracy]

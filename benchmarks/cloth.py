@@ -1,4 +1,4 @@
-"""NVIDIA's cloth case: how fast physjax steps springs, beside Warp, Taichi and NumPy doing the same work in the same run.
+"""NVIDIA's cloth case: how fast physjax steps springs, next to Warp, Taichi and NumPy doing the same work in the same run.
 
     python benchmarks/cloth.py [--quick] [--out DIR]
 
@@ -12,7 +12,7 @@ use one (taskset -c 0). Needs the extra `bench`.
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import harness
@@ -61,7 +61,7 @@ class Contender(NamedTuple):
 
     name: str
     family: str
-    run: Callable[[], Any]
+    run: Callable[[], object]
 
 
 def build_scene(lattice: lattices.Lattice, pinned: np.ndarray) -> Scene:
@@ -130,7 +130,7 @@ def with_physjax(scene: Scene, steps: int) -> Iterator[Contender]:
     yield Contender(f"physjax, {scene.forces[1].layout}", OURS, partial(simulate_final, scene, steps))
 
 
-def run_numpy(given: Case, steps: int, kind: Any = F) -> np.ndarray:
+def run_numpy(given: Case, steps: int, kind: type[np.floating] = F) -> np.ndarray:
     """The same step in NumPy: forces on springs, summed at their ends by bincount."""
     x, rest, free = (a.astype(kind) for a in (given.x, given.rest, given.free))
     (i, j), v = given.pairs.T, np.zeros_like(x)
@@ -283,7 +283,7 @@ def measure_second(count: int) -> dict[str, Any]:
 
 
 def race_copies(size: Settings) -> list[dict]:
-    """(c): many small cloths in one vmap, beside one cloth of about as many nodes."""
+    """(c): many small cloths in one vmap, next to one cloth of about as many nodes."""
     small, side = build_grid(16), round((256 * size.cloths) ** 0.5)
     states = jax.tree.map(lambda a: jnp.tile(a, (size.cloths, 1, 1)), small.state)
 

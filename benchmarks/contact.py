@@ -10,13 +10,14 @@ is timed, no ball may have passed the floor.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
 from harness import Bar, print_progress
+from jax.typing import ArrayLike
 
 from physjax import Particles, Scene, contacts, forces, methods, simulate
 
@@ -68,7 +69,7 @@ def build_balls(size: Settings, case: Case, response: Callable | None) -> Scene:
     )
 
 
-def run(scene: Scene, method: Callable, size: Settings, first: Any) -> jax.Array:
+def run(scene: Scene, method: Callable, size: Settings, first: ArrayLike) -> jax.Array:
     """The final positions; frames are kept twice, as in a long run."""
     half = size.steps // 2
     flight = simulate(scene, method, dt=DT, steps=size.steps, save_every=half, first_step=first)

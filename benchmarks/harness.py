@@ -1,9 +1,9 @@
 """What every benchmark shares: the machine, timing side by side, counting compilations, tables, charts, whole files.
 
-Contenders take turns in one process, one round after the other, so that whatever else the machine does meets all of
-them. A turn lasts half a second for everyone, so that no short call slips through a gap that a long one cannot, and
+Contenders take turns in one process, one round after the other, so that whatever else the machine does affects all
+of them. A turn lasts half a second for everyone, so that no short call slips through a gap that a long one cannot, and
 begins with a call that does not count: it pays for what the one before left behind (memory to return, cold caches).
-The very first call, which compiles, is kept apart. Times are those of finished work.
+The very first call, which compiles, is recorded separately. Times are those of finished work.
 """
 
 import argparse
@@ -24,11 +24,14 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # what is measured is this checkout, installed or not
 
 import jax
+from jax.stages import Wrapped
+from jaxtyping import PyTree
 
 import physjax
 from physjax.files import ensure_writable_folder, write_atomically
@@ -82,7 +85,7 @@ class Bar(NamedTuple):
 
     @property
     def met(self) -> bool:
-        """Whether it is."""
+        """Whether it is met."""
         return self.measured >= self.wanted if self.relation == ">=" else self.measured <= self.wanted
 
 
@@ -95,10 +98,10 @@ def record_compilations() -> Iterator[list[float]]:
 
 
 class Missing(Exception):
-    """Something that this machine lacks, in plain words."""
+    """Something that this machine lacks."""
 
 
-def import_optional(module: str, package: str | None = None) -> Any:
+def import_optional(module: str, package: str | None = None) -> ModuleType:
     """An installed module, or `Missing` with what to install."""
     try:
         return importlib.import_module(module)
@@ -123,13 +126,13 @@ def compile_c(source: str) -> ctypes.CDLL:
 
 
 def time_side_by_side(
-    contenders: Mapping[str, Callable[[], Any]],
+    contenders: Mapping[str, Callable[[], object]],
     repeats: int,
     check: Callable[[str, Any], None] = lambda name, found: None,
 ) -> tuple[dict[str, Timing], dict[str, str]]:
     """Let all contenders take a turn in each of `repeats` rounds, after a first call whose result is `check`ed.
 
-    Nothing is timed before all are checked. Returns the times, and the reasons of those whose first call failed.
+    Nothing is timed before all are checked. Returns the times, and why the others failed in their first call.
     """
     firsts, failed = {}, {}
     for name, run in contenders.items():
@@ -150,7 +153,7 @@ def time_side_by_side(
     return {name: Timing(*firsts[name], *zip(*times, strict=True)) for name, times in taken.items()}, failed
 
 
-def time_turn(run: Callable[[], Any]) -> tuple[float, float]:
+def time_turn(run: Callable[[], object]) -> tuple[float, float]:
     """Mean seconds and processor seconds of a call, over calls that fill a turn after one that does not count.
 
     A call that fills the turn by itself is not repeated.
@@ -166,7 +169,7 @@ def time_turn(run: Callable[[], Any]) -> tuple[float, float]:
     return (time.perf_counter() - start) / calls, (time.process_time() - busy) / calls
 
 
-def time_call(run: Callable[[], Any]) -> float:
+def time_call(run: Callable[[], object]) -> float:
     """Seconds until the result of a call is there [s]."""
     start = time.perf_counter()
     jax.block_until_ready(run())
@@ -184,13 +187,13 @@ def time_imports(modules: Sequence[str], repeats: int) -> dict[str, float]:
     return {module: min(taken) for module, taken in seconds.items()}
 
 
-def measure_temporary_bytes(function: Any, *arguments: Any) -> int:
+def measure_temporary_bytes(function: Wrapped, *arguments: PyTree) -> int:
     """Memory that a compiled function needs besides its arguments and results [bytes]."""
     return function.lower(*arguments).compile().memory_analysis().temp_size_in_bytes
 
 
 def describe_machine() -> dict[str, Any]:
-    """What was measured on: device, processor, cores this process may use, load, versions, flags."""
+    """The machine: device, processor, cores this process may use, load, versions, flags."""
     device = jax.devices()[0]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     return {
@@ -224,22 +227,24 @@ def has_avx512() -> bool:
     return "avx512f" in (_read_cpuinfo("flags") or "").split()
 
 
-def parse_options(about: str) -> tuple[bool, Path]:
+def parse_options(about: str | None) -> tuple[bool, Path]:
     """The command line: whether to be quick, and the folder of the results, tried before the work."""
     given = parse_arguments(build_parser(about))
     return given.quick, given.out
 
 
-def build_parser(about: str) -> argparse.ArgumentParser:
+def build_parser(about: str | None) -> argparse.ArgumentParser:
     """The options that every benchmark has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small sizes: shows that everything runs, proves nothing")
+    parser.add_argument(
+        "--quick", action="store_true", help="small sizes: shows that everything runs, measures nothing"
+    )
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="where results go (%(default)s)")
     return parser
 
 
 def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """What was given, the folder of the results tried."""
+    """The parsed arguments; the folder of the results has been tried."""
     given = parser.parse_args()
     try:
         given.out = ensure_writable_folder(given.out)
@@ -249,7 +254,7 @@ def parse_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def result_path(folder: Path, name: str, quick: bool, ending: str) -> Path:
-    """`<name>-<device>-jax<version>.<ending>`; a quick run, which proves nothing, is marked as such."""
+    """`<name>-<device>-jax<version>.<ending>`; a quick run, which measures nothing, is marked as such."""
     device = re.sub(r"[^a-z0-9]+", "-", jax.devices()[0].device_kind.lower()).strip("-")
     return folder / f"{name}-{device}-jax{jax.__version__}{'-quick' if quick else ''}.{ending}"
 
@@ -261,7 +266,7 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
         file.write("\n")
 
 
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str | float]]) -> None:
     """A table whose first column is text and whose others are numbers."""
     cells = [list(head), *([cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
@@ -313,7 +318,7 @@ def print_rates(title: str, unit: str, rows: Sequence[Mapping[str, Any]], ours: 
 
 
 def print_bars(bars: Sequence[Bar], quick: bool) -> None:
-    """What was promised, what was measured."""
+    """Each bar, what was measured, and whether it is met."""
     verdicts = ["-" if quick else "met" if bar.met else "MISSED" for bar in bars]
     lines = [
         [bar.name, bar.measured, f"{bar.relation} {bar.wanted:g}", verdict]
@@ -328,7 +333,7 @@ def draw_bar_chart(
     foot: str,
     labels: Mapping[str, str] | None = None,
 ) -> None:
-    """Horizontal bars on a logarithmic axis: a panel is (title, axis label, rows as made by `row`).
+    """Horizontal bars on a logarithmic axis: a panel is (title, axis label, rows as made by `make_row`).
 
     Bars are the best of the turns, ticks their median. `labels` say what the families mean where it is not
     their own name. The file is whole or absent.
@@ -364,7 +369,7 @@ def draw_bar_chart(
 
 
 def print_progress(what: str) -> None:
-    """Progress, apart from the results."""
+    """Progress, on standard error, so that it stays apart from the results."""
     print(what, file=sys.stderr, flush=True)
 
 

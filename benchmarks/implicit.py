@@ -1,4 +1,4 @@
-"""Implicit Euler on a stiff cloth: what a frame costs, and what accuracy a second of computing buys beside explicit methods.
+"""Implicit Euler on a stiff cloth: what a frame costs, and what accuracy a second buys, compared with explicit methods.
 
     python benchmarks/implicit.py [--quick] [--out DIR]
 
@@ -14,14 +14,17 @@ All run on one core if the process may use one (taskset -c 0).
 import math
 import statistics
 import time
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import harness
 import jax
 import jax.numpy as jnp
 import numpy as np
 from harness import Bar, Missing, print_progress
+from jax.typing import DTypeLike
 
 from physjax import Particles, Scene, forces, lattices, methods, simulate
 from physjax.files import write_atomically
@@ -50,7 +53,7 @@ FULL = Settings(81, 90, 15, 5, 5)
 QUICK = Settings(17, 6, 3, 2, 1)
 
 
-def build_cloth(side: int, dtype: Any = np.float32) -> Scene:
+def build_cloth(side: int, dtype: DTypeLike = np.float32) -> Scene:
     """The cloth, with its weight."""
     sheet = lattices.cloth(1.0, 1.0, side, side, mass=1.0, structural=1000.0, shear=1000.0, bend=100.0)
     state = Particles(*(jnp.asarray(leaf, dtype) for leaf in sheet.state))
@@ -59,7 +62,7 @@ def build_cloth(side: int, dtype: Any = np.float32) -> Scene:
 
 
 def time_frames(scene: Scene, frames: int) -> tuple[list[float], list[int], list[float], Scene]:
-    """Seconds, products with the matrix and relative residual of each frame, each called by itself; the scene half way."""
+    """Seconds, matrix products and relative residual of each frame, each called separately; the scene half way through."""
     step = partial(simulate, method=GAME_METHOD, dt=DT, steps=1)
     jax.block_until_ready(step(scene).state)
     seconds, products, residuals, middle = [], [], [], scene
@@ -84,13 +87,13 @@ def build_system(scene: Scene) -> tuple[Any, jax.Array]:
     return lambda u: u - DT * push(DT * u, u), DT * (a + push(DT * v, jnp.zeros_like(v)))
 
 
-def build_linear_contenders(scene: Scene) -> dict[str, Any]:
-    """The linear system of a step to the same residual, by ours, by lineax and by a round of optimistix's Newton method."""
+def build_linear_contenders(scene: Scene) -> dict[str, Callable]:
+    """The linear system of a step to the same residual, by ours, by lineax's and by a round of optimistix's Newton method."""
     lx, optx = harness.import_optional("lineax"), harness.import_optional("optimistix")
     two_norm = lambda r: jnp.sqrt(jnp.sum(r * r))  # noqa: E731
     inner = lambda a, b: jnp.sum(a[0] * b[0])  # noqa: E731
 
-    def solved(solve):
+    def build_run(solve):
         """The solution with its residual, found by the program that knows the matrix: rounding makes another one of it."""
 
         @jax.jit
@@ -124,13 +127,13 @@ def build_linear_contenders(scene: Scene) -> dict[str, Any]:
         return size * found.value
 
     return {
-        "physjax, conjugate gradients": solved(ours),
-        "lineax, CG": solved(lineax),
-        "optimistix, a Newton step with CG": solved(optimistix),
+        "physjax, conjugate gradients": build_run(ours),
+        "lineax, CG": build_run(lineax),
+        "optimistix, a Newton step with CG": build_run(optimistix),
     }
 
 
-def build_newton_contenders(scene: Scene) -> dict[str, Any]:
+def build_newton_contenders(scene: Scene) -> dict[str, Callable]:
     """The full equation of a step, u = dt a(x + dt (v + u), v + u), to the same residual, by ours and by optimistix."""
     lx, optx = harness.import_optional("lineax"), harness.import_optional("optimistix")
     two_norm = lambda r: jnp.sqrt(jnp.sum(r * r))  # noqa: E731
@@ -166,12 +169,14 @@ def build_newton_contenders(scene: Scene) -> dict[str, Any]:
     # as few rounds as reach the residual, or its best
     tries = {rounds: theirs(rounds) for rounds in range(1, 9)}
     found = {rounds: float(run()[1]) for rounds, run in tries.items()}
-    reached = [rounds for rounds, r in found.items() if r <= RESIDUAL_TOLERANCE] or [min(found, key=found.get)]
+    reached = [rounds for rounds, r in found.items() if r <= RESIDUAL_TOLERANCE] or [
+        min(found, key=lambda rounds: found[rounds])
+    ]
     print_progress(f"  optimistix reaches {found[reached[0]]:.1e} in {reached[0]} rounds")
     return {"physjax, ImplicitEuler(newton=20)": measured(ours), "optimistix, Newton": tries[reached[0]]}
 
 
-def race(contenders: dict[str, Any], goal: float, repeats: int) -> list[dict]:
+def race(contenders: dict[str, Callable], goal: float, repeats: int) -> list[dict]:
     """Milliseconds and residual of each contender; one that failed says why."""
     rows, found = [], {}
     timings, failed = harness.time_side_by_side(
@@ -211,8 +216,8 @@ def compute_truth(size: Settings, omega: float) -> np.ndarray:
         return np.asarray(simulate_final(scene, methods.rk4, steps, size))
 
 
-def simulate_final(scene: Scene, method: Any, steps: int, size: Settings) -> jax.Array:
-    """Positions at the horizon after so many steps."""
+def simulate_final(scene: Scene, method: Callable, steps: int, size: Settings) -> jax.Array:
+    """Positions at the horizon after `steps` steps."""
     run = simulate(scene, method, dt=size.horizon * DT / steps, steps=steps, save_every=steps)
     return run.final_scene.state.position
 
@@ -237,7 +242,7 @@ def measure_work_and_error(scene: Scene, size: Settings, omega: float) -> list[d
     return rows
 
 
-def draw(path: Any, seconds: list[float], rows: list[dict], size: Settings, foot: str) -> None:
+def draw(path: Path, seconds: list[float], rows: list[dict], size: Settings, foot: str) -> None:
     """Frames by their time, and error against time."""
     from matplotlib.figure import Figure
 

@@ -1,11 +1,11 @@
-"""Particles that are born and die, beside the same scene without births, NumPy and Warp.
+"""Particles that are born and die, compared with the same scene without births, NumPy and Warp.
 
     python benchmarks/particles.py [--quick] [--out DIR]
 
-100 000 particles in space, float32, semi-implicit Euler, 100 steps: gravity, quadratic drag in a wind, a bouncing plane
-that answers at the end of the step or, as `impact`, within it, and 20 000 births a second (200 a step) from a point into
-a cone. NumPy and Warp overwrite the next 200 slots at every step, at its end. The contenders take turns on one core;
-bars are judged by the best turn of each. Also the memory of a process that runs a million.
+100 000 particles in space, float32, semi-implicit Euler, 100 steps: gravity, quadratic drag in a wind, a plane with
+restitution whose contacts are resolved at the end of the step or, by `impact`, within it, and 20 000 births a second (200
+a step) from a point into a cone. NumPy and Warp overwrite the next 200 slots at the end of every step. The contenders take
+turns on one core; bars are judged by the best turn of each. Also the memory of a process that runs a million.
 """
 
 import resource

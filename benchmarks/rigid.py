@@ -1,17 +1,17 @@
-"""Free tumbling boxes beside MuJoCo's MJX, which is JAX as well: the same boxes, steps and precision, in one process.
+"""Free tumbling boxes next to MuJoCo's MJX, which is JAX as well: the same boxes, steps and precision, in one process.
 
     python benchmarks/rigid.py [--quick] [--out DIR]
 
 4096 boxes of 1 kg with sides of 0.5 to 2 m fly and tumble under gravity, float32, steps of 2 ms, by semi-implicit Euler
 and by RK4, on one core if the process may use one (taskset -c 0). MJX (pip install mujoco-mjx) has a free joint and a
-box each, contacts and constraints disabled; its Euler is semi-implicit as ours. Before anything is timed, both must
-have brought boxes of one start to the same place and orientation. A scene here pays only for what it uses; MJX's step
+box each, contacts and constraints disabled; its Euler is semi-implicit, like ours. Before anything is timed, both must
+have moved the same boxes to the same place and orientation. A scene here pays only for what it uses; MJX's step
 does all that a tree of joints may need (kinematics, mass matrix, its factorisation) for every body.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import harness
 import jax
@@ -42,7 +42,7 @@ FULL, QUICK = Settings(4096, 1000, 25, 7), Settings(64, 50, 25, 1)
 
 
 class Boxes(NamedTuple):
-    """Where boxes begin: sides [m], orientation, velocity [m/s], angular velocity seen from the box [rad/s]."""
+    """Where boxes begin: sides [m], orientation, velocity [m/s], angular velocity in the box's frame [rad/s]."""
 
     sides: np.ndarray
     orientation: np.ndarray
@@ -67,12 +67,12 @@ def build_scene(boxes: Boxes) -> Scene:
 
 
 def run_physjax(scene: Scene, method: Callable, steps: int) -> RigidBodies:
-    """The boxes after so many steps."""
+    """The boxes after `steps` steps."""
     return simulate(scene, method, dt=DT, steps=steps, save_every=steps).final_scene.state
 
 
 def build_mjx_run(boxes: Boxes, integrator: str, steps: int) -> Callable:
-    """A function that steps the boxes in MJX so many times and returns positions and orientations."""
+    """A function that takes `steps` steps of the boxes in MJX and returns positions and orientations."""
     mujoco, mjx = harness.import_optional("mujoco"), harness.import_optional("mujoco.mjx", "mujoco-mjx")
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><option timestep="{DT}" integrator="{integrator}" gravity="0 0 -9.8">'
@@ -94,7 +94,7 @@ def build_mjx_run(boxes: Boxes, integrator: str, steps: int) -> Callable:
     return partial(run, *map(jnp.asarray, (moments, boxes.orientation, boxes.velocity, boxes.spin)))
 
 
-def check_agreement(scene: Scene, method: Callable, law: str, qpos: Any, steps: int) -> float:
+def check_agreement(scene: Scene, method: Callable, law: str, qpos: jax.Array, steps: int) -> float:
     """The largest difference between ours and MJX's boxes after its steps; SystemExit if it is more than it may be."""
     state = run_physjax(scene, method, steps)
     apart = np.abs(np.asarray(qpos[:, :3]) - state.position).max()

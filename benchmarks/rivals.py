@@ -1,4 +1,4 @@
-"""Who flies the projectiles of `throughput.py`: physjax, diffrax, NumPy, C, numba and Warp, each in the way that is fast for it.
+"""The contenders of `throughput.py`: physjax, diffrax, NumPy, C, numba and Warp, each in the way that is fast for it.
 
 Each `with_...(lanes, steps)` yields contenders that do the same work: gravity and quadratic drag in space, float32, classical
 Runge-Kutta. It raises `Missing` where a tool is not installed.
@@ -7,7 +7,7 @@ Runge-Kutta. It raises `Missing` where a tool is not installed.
 import ctypes
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import harness
@@ -29,16 +29,16 @@ G, MASS, AREA, DRAG, AIR_DENSITY, DT = (
 K = 0.5 * AIR_DENSITY * DRAG * AREA / MASS
 OURS, JAX, OTHER = harness.COLOURS
 SOFTENING_LENGTH = 0.05
-HOST_LABEL = "" if jax.default_backend() == "cpu" else " (CPU)"  # said of whoever stays on the CPU when JAX does not
+HOST_LABEL = "" if jax.default_backend() == "cpu" else " (CPU)"  # marks what stays on the CPU when JAX does not
 F = np.float32
 
 
 class Contender(NamedTuple):
-    """Who runs: a name, its family, a call that returns the final positions `(lanes, 3)`, and whether it is rk4."""
+    """A contender: a name, its family, a call that returns the final positions `(lanes, 3)`, and whether it is rk4."""
 
     name: str
     family: str
-    run: Callable[[], Any]
+    run: Callable[[], object]
     rk4: bool = True
 
 
@@ -194,7 +194,7 @@ void fly(column x, column y, column z, column u, column v, column w, long n, lon
 """
 
 
-def run_columns(function: Callable, lanes: int, *numbers: Any) -> np.ndarray:
+def run_columns(function: Callable, lanes: int, *numbers: float | np.floating) -> np.ndarray:
     """Run a kernel that changes six arrays in place: x, y, z and their velocities."""
     columns = [column.copy() for array in sample_shots(lanes) for column in array.T]
     function(*columns, *numbers)

@@ -3,7 +3,7 @@
     python benchmarks/sweep.py [--quick] [--out DIR]
 
 A ball with quadratic drag, 1000 speeds by 1000 angles, 400 steps of rk4 in float32, where it is after 4 s. The bare run is
-one scene of a million lanes; the sweep measures one ball, in memory and into a folder. The rivals are given the largest
+one scene of a million lanes; the sweep measures one ball, in memory and into a folder. The competitors are given the largest
 tolerance at which their worst error, on a thousand of the shots, is no more than that of the sweep: SciPy's `solve_ivp`
 (RK45, float64) flies these thousand one by one, from which a million is extrapolated, and diffrax (Tsit5, adaptive,
 float32) a hundred thousand in one `vmap`. What two CPU devices
@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,20 +62,20 @@ def build_axes(points: int) -> dict[str, np.ndarray]:
     }
 
 
-def build_shot(speed: Any, angle: Any) -> Scene:
+def build_shot(speed: jax.Array, angle: jax.Array) -> Scene:
     """Balls thrown from the origin."""
     launch = speed[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     drag = forces.QuadraticDrag(area=AREA, coefficient=DRAG, density=DENSITY)
     return Scene(Particles(jnp.zeros_like(launch), launch), mass=MASS, forces=(forces.Gravity(G), drag))
 
 
-def fly_to_end(speed: Any, angle: Any) -> jax.Array:
+def fly_to_end(speed: jax.Array, angle: jax.Array) -> jax.Array:
     """Where a ball is after the flight [m]."""
     flight = simulate(build_shot(speed, angle), methods.rk4, dt=DT, steps=STEPS, save_every=STEPS)
     return flight.final_scene.state.position
 
 
-def find_apex(speed: Any, angle: Any) -> jax.Array:
+def find_apex(speed: jax.Array, angle: jax.Array) -> jax.Array:
     """The greatest height [m] of a hundred frames, which all lanes at once could not keep."""
     flight = simulate(build_shot(speed, angle), methods.rk4, dt=DT, steps=STEPS, save_every=STEPS // 100)
     return jnp.max(flight.position[:, 1])
@@ -124,12 +125,12 @@ def run_scipy(speed: np.ndarray, angle: np.ndarray, tolerance: float) -> np.ndar
     return np.array([solve_ivp(rate, (0, STEPS * DT), y, rtol=tolerance, atol=tolerance).y[:2, -1] for y in starts])
 
 
-def worst_error(found: Any, truth: np.ndarray) -> float:
-    """The worst distance from the truth [m]."""
+def worst_error(found: np.ndarray, truth: np.ndarray) -> float:
+    """The largest distance from the reference solution [m]."""
     return float(np.sqrt(((np.asarray(found, float) - truth) ** 2).sum(-1)).max())
 
 
-def match_tolerance(fly: Any, truth: np.ndarray, allowed: float) -> tuple[float, float]:
+def match_tolerance(fly: Callable[[float], np.ndarray], truth: np.ndarray, allowed: float) -> tuple[float, float]:
     """The largest tolerance whose worst error is allowed, or else the one of the least error; and that error [m]."""
     tried = [(tolerance, worst_error(fly(tolerance), truth)) for tolerance in TOLERANCES]
     return next((one for one in tried if one[1] <= allowed), min(tried, key=lambda one: one[1]))
@@ -146,7 +147,7 @@ def run_alone(task: str, *, points: int, devices: int, repeats: int) -> list[flo
 def time_devices(points: int, repeats: int) -> tuple[float, ...]:
     """The least times of a sweep on one device on one core, and on two devices on two cores, taken in turn [s]."""
     mine = sorted(os.sched_getaffinity(0))
-    cores = [*mine, *(core for core in range(os.cpu_count()) if core not in mine)]
+    cores = [*mine, *(core for core in range(os.cpu_count() or 1) if core not in mine)]
     taken = {1: [], 2: []}
     for _ in range(1 + repeats):  # the first pays for the compilations
         for count, times in taken.items():

@@ -1,10 +1,10 @@
-"""How fast physjax is, beside diffrax, NumPy, C, numba and Warp doing the same work in the same run.
+"""How fast physjax is, next to diffrax, NumPy, C, numba and Warp doing the same work in the same run.
 
     python benchmarks/throughput.py [--quick] [--out DIR]
 
 (a) 65 536 projectiles in space under gravity and quadratic drag, float32, classical Runge-Kutta, 200 steps;
 (b) the same with a million lanes; (c) the mutual attraction of 4096 bodies, and its memory; (d) what a new scene costs
-to compile, and that a changed number compiles nothing; (e) what the import costs. All contenders of (a) must agree with
+to compile, and that a changed number does not recompile; (e) what the import costs. All contenders of (a) must agree with
 a float64 run to float32 rounding before any is timed. What is not installed is left out and named. Runs on whatever
 device JAX has; C, NumPy and numba stay on the CPU and are labelled so. Needs the extra `bench` for numba and Warp.
 """
@@ -174,7 +174,7 @@ def time_compilation() -> list[dict]:
 
 
 def build_bars(rows: list[dict], pairs: list[dict], memory: dict, compiled: list[dict], imports: dict) -> list[Bar]:
-    """What was promised, against what was measured; rates are those of the best turn."""
+    """The wanted rates against the measured ones; rates are those of the best turn."""
     flights, attraction = ({row["name"]: row["rate"] for row in table} for table in (rows, pairs))
     ours, crowd = flights["physjax rk4"], next(rate for name, rate in flights.items() if name.endswith("lanes"))
     vmapped, arrays, broadcast = (

@@ -1,7 +1,11 @@
 """Game physics in JAX: describe a scene once, run it under any method, batch it, differentiate it.
 
-Every name shows an example that runs once these lines have run: a shot, its flight, an oscillator, a flag, a brick that
-turns, a fountain.
+Nouns are records (`Particles`, `Scene`, `Trajectory`), verbs are functions (`simulate`, `sweep`, `solve`), and the modules
+are namespaces: `forces`, `contacts`, `methods`, `plot`, ... The README has the map of the package, two walks through it (dt,
+and a force's value) and a glossary.
+
+Every name has an example that runs after these lines: a shot, its flight, an oscillator, a flag, a tumbling brick, a
+fountain.
 
 Example:
     >>> import jax, jax.numpy as jnp, numpy as np
@@ -27,6 +31,7 @@ Example:
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from physjax import physics, stepping
 from physjax.checks import quantity
 from physjax.particles import Particles
 from physjax.parts import Contact, Field, Force
@@ -39,7 +44,7 @@ from physjax.stepping.simulate import simulate, state_after
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from physjax import projectile, scenes
+    from physjax import projectile, scenes, show, study
     from physjax.physics import contacts, emitters, rigid, springs
     from physjax.physics.forces import flows as fields
     from physjax.physics.rigid import inertia
@@ -81,23 +86,27 @@ __all__ = [
     "methods",
     "minimise",
     "ode_term",
+    "physics",
     "plot",
     "projectile",
     "quantity",
     "reference",
     "rigid",
     "scenes",
+    "show",
     "simulate",
     "solve",
     "springs",
     "stability",
     "state_after",
+    "stepping",
+    "study",
     "sweep",
 ]
 __version__ = "0.1.0"
 
-# loaded when first named: what not every run needs should not make `import physjax` slower
-_LATER = {
+# Where the names are that are loaded when they are first used: what not every run needs should not slow the import.
+_LAZY = {
     "Inertia": "physjax.physics.rigid.inertia:Inertia",
     "RigidBodies": "physjax.physics.rigid:RigidBodies",
     "accuracy": "physjax.study.accuracy",
@@ -117,20 +126,30 @@ _LATER = {
     "projectile": "physjax.projectile",
     "rigid": "physjax.physics.rigid",
     "scenes": "physjax.scenes",
+    "show": "physjax.show",
     "solve": "physjax.study.inverse.solve:solve",
     "springs": "physjax.physics.springs",
     "stability": "physjax.study.stability",
+    "study": "physjax.study",
     "sweep": "physjax.study.sweeps.sweep:sweep",
 }
 
+# `__all__` is taken away once type checkers have read it, so that whoever asks for it comes to `__getattr__`: a star
+# import, `help` and pdoc are about to name everything, and the last two look only at what the module already holds.
+_PUBLIC = __all__
+del __all__
+
 
 def __getattr__(name: str) -> object:
-    if name in _LATER:
-        module, _, function = _LATER[name].partition(":")
+    if name == "__all__":
+        globals().update({lazy: __getattr__(lazy) for lazy in _LAZY}, __all__=_PUBLIC)
+        return _PUBLIC
+    if name in _LAZY:
+        module, _, attribute = _LAZY[name].partition(":")
         found = import_module(module)
-        return getattr(found, function) if function else found
+        return getattr(found, attribute) if attribute else found
     raise AttributeError(f"module 'physjax' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return _PUBLIC

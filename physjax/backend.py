@@ -1,59 +1,193 @@
-"""Lanes: which arrays have an entry for each, and how to work only on those that need it.
+"""The one place that knows the compiler and the device: what XLA needs to run physics fast that is written without it.
 
-A rare branch is taken when any lane needs it. Under `vmap` JAX would turn a `cond` into a choice that computes both
-sides; `any_lane` asks all scenes of the batch together instead, so the branch stays a branch.
+Each policy has its reason and its measurement next to it. CPU figures are of two cores with AVX-512 and jax 0.10.1 or
+0.12, unless they say otherwise.
+
+- What is computed once: `any_lane`, `materialise`, `materialise_where`, `block_fusion`.
+- How a loop is compiled: `split_compilation`, `bounded_while_loop`, `needs_split_compilation`.
+- Which lanes are computed: `compact_and_apply`, `compact_and_apply_runs`.
+- How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `SOURCES_PER_TILE`.
+- What the compiler is asked for: `jit_untransformed`.
+- Which clock a search goes by, and how a device is called: `read_work_clock`, `device_kind`, `describe_device`.
 """
 
+import functools
 import math
+import platform
+import time
+import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int, PyTree
+
+T = TypeVar("T")
+"""A tree of arrays that comes back with the same structure and shapes."""
 
 MIN_LANES_TO_SELECT = 1024
-"""Scenes with fewer lanes are not worth picking lanes from."""
+"""Below this many lanes computing all of them costs less than gathering and scattering those that are flagged."""
 GROUPS_PER_SCENE = 32
-"""One lane in so many is room enough for the lanes that are picked at once."""
+"""Flagged lanes are computed in groups of one lane in 32: a group's cost is paid whole, however few lanes are in it."""
 SINGLE_PIECE_NODES = 64
-"""Scenes with no more coupled nodes are compiled as one piece, which for few nodes runs faster."""
+"""Coupled scenes with at most this many nodes are compiled as one piece, which runs faster and still compiles quickly."""
+LANES_PER_BLOCK = 8192
+"""Lanes in a block: 200 kB of state in 3-D and float32, which leaves room for the stages of a step in a 1 MB cache."""
+MIN_LANES_TO_CUT = 6 * LANES_PER_BLOCK
+"""Fewer lanes fit a cache as they are; 65 536 lanes of a flight run 20 % faster in blocks."""
+MIN_STEPS_PER_FRAME = 8
+"""With fewer steps between frames, copying into blocks and back costs more than the cache gives."""
+MAX_CARRIED_BYTES = 64 * LANES_PER_BLOCK
+"""Bytes of a sweep's block that one turn of a loop hands to the next, to stay in a core's cache with a step's stages."""
+MAX_BATCH_LANES = 16 * LANES_PER_BLOCK
+"""Lanes in a batch of a sweep at most: more gain nothing, and a batch is what a kill loses."""
+SOURCES_PER_TILE = 64
+"""Bodies whose attraction is summed at once: few enough for registers and caches, enough to hide the loop over tiles.
+
+Memory stays linear in the number of bodies. (On a GPU the same sum without tiles runs two to four times as fast.)
+"""
+WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
+"""XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster."""
+OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+"""Timed contacts are many small kernels, over which the emitters of jax 0.10 take twice the compile time of the older ones.
+
+From jax 0.11 on there are no others, and the option is gone.
+"""
+
+
+def device_kind() -> str:
+    """The kind of the device that computes by default: "cpu", "gpu" or "tpu"."""
+    return jax.default_backend()
+
+
+def on_cpu() -> bool:
+    """Whether the default device is a CPU."""
+    return device_kind() == "cpu"
+
+
+def describe_device() -> str:
+    """The device that computes by default and the operating system, e.g. "CPU (x86_64), Linux"."""
+    device = jax.devices()[0]
+    chip = platform.machine() if device.platform == "cpu" else device.device_kind
+    return f"{device.platform.upper()} ({chip}), {platform.system()}"
+
+
+def read_work_clock() -> float:
+    """Seconds by which a search is bounded: of processor time on a CPU, wall-clock time elsewhere.
+
+    Processor time does not depend on what else the machine is doing. But a GPU's work takes none: a search that waits
+    for one would never end.
+    """
+    return time.process_time() if on_cpu() else time.perf_counter()
+
+
+# what is computed once
 
 
 @jax.custom_batching.custom_vmap
 def any_lane(flag: Bool[Array, "..."]) -> Bool[Array, ""]:
-    """Whether any lane is flagged, of this scene and of all that are batched with it: one answer for the whole batch."""
+    """Whether any lane is flagged, of this scene and of all that are batched with it.
+
+    A rare branch is taken when any lane needs it. Under `vmap` JAX would turn a `cond` on a batched predicate into a
+    `select` that computes both sides; one predicate for the whole batch keeps it a branch.
+    """
     return jnp.any(flag)
 
 
 @any_lane.def_vmap
-def _any_lane_of_a_batch(axis_size, batched, flag):
+def _any_lane_of_a_batch(axis_size: int, batched: list[bool], flag: Bool[Array, "..."]) -> tuple[Array, bool]:
     return any_lane(jnp.any(flag, axis=0)), False
 
 
-def materialise_where(flag: Bool[Array, "..."], function: Callable, like: Any = None) -> Any:
-    """`function()`, kept apart from what reads it: XLA on CPU would compute it again in each of its many readers.
+def materialise_where(flag: Bool[Array, "..."], function: Callable[[], T], like: T | None = None) -> T:
+    """`function()`, computed once and stored before anything reads it; where no lane is flagged it may be `like` instead.
 
-    Where no lane is flagged it may be `like` instead (zeros by default); the compiler cannot know whether there is one.
+    XLA on a CPU computes a cheap producer again in each of its readers, and a chain of stages exponentially often. It
+    does not move code out of a branch, so the result of one is stored. `like` is zero by default.
     """
     if like is None:
         like = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function))
     return lax.cond(any_lane(flag), function, lambda: like)
 
 
-def materialise(t: ArrayLike, function: Callable) -> Any:
-    """`function()`, kept apart from what reads it at any finite time t; on CPU by a branch that the compiler must believe in."""
-    if jax.default_backend() == "cpu":
+def materialise(t: ArrayLike, function: Callable[[], T]) -> T:
+    """`function()`, computed once and stored before anything reads it, at any finite time t.
+
+    On a CPU by a branch whose predicate the compiler cannot evaluate: under jax 0.10 a barrier does not hold there. 200
+    steps of rk4 of a flag of 16 x 24 nodes take 10 ms with it, 49 without and 51 with a barrier; under jax 0.12 8, 39
+    and 9. On a GPU a branch would ask the host (tens of µs).
+    """
+    if on_cpu():
         return materialise_where(jnp.isfinite(t), function)
     return lax.optimization_barrier(function())
 
 
+def block_fusion(tree: T) -> T:
+    """The arrays as they are; what computes them is not fused with what reads them.
+
+    For what each reader would otherwise compute again: a spring's tension for every component and both ends, the
+    padded copy of a sheet for each of its shifted slices, the path of a prescribed node for all of its neighbours. The
+    flag of `materialise` takes 1.4 times as long without.
+    """
+    return lax.optimization_barrier(tree)
+
+
+# how a loop is compiled
+
+
+def needs_split_compilation(couples: bool, lanes: tuple[int, ...]) -> bool:
+    """Whether the steps of a scene are compiled in pieces: where more than a few nodes are coupled."""
+    return couples and lanes[-1:] > (SINGLE_PIECE_NODES,)
+
+
+def split_compilation(state: PyTree, step: Int[Array, ""]) -> PyTree:
+    """The state as it is; on a CPU a loop over `step` that has this in its body is compiled in pieces.
+
+    XLA on a CPU makes one LLVM function of a small loop and of everything in it, whose compile time grows faster than
+    its length: the gradient of 200 rk4 steps of a cloth took 136 s to compile, in pieces 9 s.
+    """
+    return jax.tree.map(lambda leaf: _sort_in_passing(leaf, step), state) if on_cpu() else state
+
+
+@partial(jax.checkpoint, prevent_cse=False)  # so that reverse mode has a sort in its loop as well
+def _sort_in_passing(array: Array, number: Int[Array, ""]) -> Array:
+    """The array times one, which is found by sorting two numbers: no loop with a sort in it is made one function."""
+    return array * (lax.sort(jnp.stack([number, number + 1]))[0] == number).astype(array.dtype)
+
+
+def bounded_while_loop(going: Callable[[T], Array], body: Callable[[T], T], start: T, *, most: int) -> T:
+    """`lax.while_loop(going, body, start)` with at most `most` turns.
+
+    On a CPU it is compiled in pieces where lanes are few, by a sort of two counters: with many lanes XLA does that by
+    itself. Two rough balls took half a minute to compile while each of their small loops was one function.
+    """
+    few = on_cpu() and max(leaf.size for leaf in jax.tree.leaves(start)) < MIN_LANES_TO_SELECT
+
+    def goes_on(state):
+        return going(state[0]) & (state[1][0] < most)
+
+    def turn(state):
+        carry, count = state
+        return body(carry), lax.sort(count + 1) if few else count + 1
+
+    return lax.while_loop(goes_on, turn, (start, jnp.arange(2, dtype=jnp.int32)))[0]
+
+
+# which lanes are computed
+
+
 def compact_and_apply(
-    function: Callable, flag: Bool[Array, "*lanes"], changing: Any, *others: Any, masks: Any, cut: bool
-) -> Any:
+    function: Callable[..., T],
+    flag: Bool[Array, "*lanes"],
+    changing: T,
+    *others: PyTree,
+    masks: PyTree,
+    cut: bool,
+) -> T:
     """`function(changing, *others)`, computed only if a lane is flagged; it must leave the other lanes as they are.
 
     `changing` and what comes back are trees of per-lane arrays; `masks` say of `others` which arrays are. With `cut`, and
@@ -68,7 +202,7 @@ def compact_and_apply(
     flat = jax.tree.map(by_lane, changing)
     words, upto = _pack_flags(flag.ravel())
 
-    def group(now, first):
+    def apply_to_group(now, first):
         index = _find_flagged_lanes(words, upto, first + jnp.arange(size, dtype=jnp.int32))
         pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
         few = jax.tree.map(lambda a, has_lanes: pick(by_lane(a)) if has_lanes else a, others, masks)
@@ -76,32 +210,34 @@ def compact_and_apply(
         # beyond the last flagged lane there is none, and nothing is written
         return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop"), now, done)
 
-    def groups(now, first):
-        some = lambda now, first: (  # noqa: E731
-            lax.cond(any_lane(first < upto[-1]), lambda: group(now, first), lambda: now),
+    def apply_to_groups(now, first):
+        apply = lambda now, first: (  # noqa: E731
+            lax.cond(any_lane(first < upto[-1]), lambda: apply_to_group(now, first), lambda: now),
             None,
         )
-        return lax.scan(some, now, first)[0]
+        return lax.scan(apply, now, first)[0]
 
     firsts = jnp.arange(0, total, size, dtype=jnp.int32)
-    end = groups(flat, firsts[:1])
-    end = lax.cond(any_lane(upto[-1] > size), lambda: groups(end, firsts[1:]), lambda: end)
+    end = apply_to_groups(flat, firsts[:1])
+    end = lax.cond(any_lane(upto[-1] > size), lambda: apply_to_groups(end, firsts[1:]), lambda: end)
     return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
 
 
-def compact_and_apply_runs(function: Callable, flagged: Callable, changing: Any, *others: Any) -> Any:
-    """`function(changing, *others)`, computed only where `flagged(changing, *others)`, for flags that stand side by side.
+def compact_and_apply_runs(
+    function: Callable[..., T], flagged: Callable[..., Bool[Array, "lanes"]], changing: T, *others: PyTree
+) -> T:
+    """`function(changing, *others)`, computed only where `flagged(changing, *others)`, for flags that come in runs.
 
     `changing` and what comes back are trees of arrays along one axis of lanes; the function must leave other lanes as they
-    are, and do away with the flag of those it is for. Windows slide to the next flagged lane until there is none: a
-    slice is copied where the lanes picked by `compact_and_apply` would be gathered and scattered. Reverse mode goes through.
+    are, and clear the flag of those it is for. Windows slide to the next flagged lane until there is none: a slice is
+    copied where the lanes picked by `compact_and_apply` would be gathered and scattered. Reverse mode goes through.
     """
     total = len(jax.tree.leaves(changing)[0])
     if total < MIN_LANES_TO_SELECT:
         return lax.cond(any_lane(flagged(changing, *others)), lambda: function(changing, *others), lambda: changing)
     size = math.ceil(total / GROUPS_PER_SCENE)
 
-    def window(now):
+    def apply_to_window(now):
         first = jnp.minimum(jnp.argmax(flagged(now, *others)).astype(jnp.int32), total - size)
         cut = partial(jax.tree.map, lambda leaf: lax.dynamic_slice_in_dim(leaf, first, size))
         done = function(cut(now), *map(cut, others))
@@ -110,7 +246,7 @@ def compact_and_apply_runs(function: Callable, flagged: Callable, changing: Any,
     def where_left(go_on, now):
         return lax.cond(any_lane(flagged(now, *others)), lambda: go_on(now), lambda: now)
 
-    once = partial(where_left, window)
+    once = partial(where_left, apply_to_window)
     # the last window is moved back to fit, and so may be one more for lanes that come round to the first
     rest = lambda now: lax.scan(lambda now, _: (once(now), None), now, length=GROUPS_PER_SCENE)[0]  # noqa: E731
     return where_left(rest, once(changing))
@@ -127,7 +263,7 @@ def _pack_flags(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
 
 
 def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
-    """The lanes of the flags with these numbers, counted from zero; the number of lanes or more where there are not so many."""
+    """The lanes of the flags with these numbers, counted from zero; at least the number of lanes where there are fewer flags."""
     word = jnp.searchsorted(upto, number + 1, method="scan_unrolled").astype(jnp.int32)
     left = words.at[word].get(mode="clip")
     rank = number - upto.at[word].get(mode="clip") + lax.population_count(left).astype(jnp.int32)
@@ -141,26 +277,61 @@ def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
     return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
 
 
-def bounded_while_loop(going: Callable, body: Callable, start: Any, *, most: int) -> Any:
-    """`lax.while_loop(going, body, start)`, at most so many times, which compiles in pieces where the lanes are few."""
-    few = jax.default_backend() == "cpu" and max(leaf.size for leaf in jax.tree.leaves(start)) < MIN_LANES_TO_SELECT
-
-    def again(state):
-        return going(state[0]) & (state[1][0] < most)
-
-    def once(state):
-        carry, count = state
-        return body(carry), lax.sort(count + 1) if few else count + 1
-
-    return lax.while_loop(again, once, (start, jnp.arange(2, dtype=jnp.int32)))[0]
+# how much is computed at once
 
 
-@partial(jax.checkpoint, prevent_cse=False)  # so that reverse mode has a sort in its loop as well
-def split_compilation(array: Array, number: Array) -> Array:
-    """The array as it is; a loop over `number` that has this in its body is compiled in pieces.
+def count_lane_blocks(lanes: int, steps_per_frame: int) -> int | None:
+    """Into how many blocks independent lanes are cut that are stepped one after the other; None where that does not pay.
 
-    XLA on CPU makes one function of a small loop and of everything in it. Few lines run faster so; many, such as the
-    gradient of a cloth's step, take ten times as long to compile. A sort, be it of two numbers, is what it will not
-    have there.
+    A block stays in a CPU's cache between two frames, so the state crosses main memory once a frame instead of once a
+    step: a million lanes run at the speed of ten thousand. A GPU has no such cache, and wants all lanes at once.
     """
-    return array * (lax.sort(jnp.stack([number, number + 1]))[0] == number).astype(array.dtype)
+    if not on_cpu() or lanes < MIN_LANES_TO_CUT or steps_per_frame < MIN_STEPS_PER_FRAME:
+        return None
+    return math.ceil(lanes / LANES_PER_BLOCK)
+
+
+def choose_block_lanes(device: jax.Device, carried_bytes: int) -> int:
+    """Lanes in a block of a sweep on a device, where each carries so many bytes through a loop.
+
+    A CPU is fastest in its cache, anything else with all that it can hold.
+    """
+    return min(MAX_CARRIED_BYTES // carried_bytes, LANES_PER_BLOCK) if device.platform == "cpu" else MAX_BATCH_LANES
+
+
+# what the compiler is asked for
+
+
+def jit_untransformed(
+    function: Callable[..., T], device: jax.Device | None = None, *, many_small_kernels: bool = False, **options: Any
+) -> Callable[..., T]:
+    """`jax.jit(function, **options)` with what makes a program fast on a device, the default one unless given.
+
+    For functions that no `jit`, `vmap` or `grad` is around: XLA's options belong to a whole program, and JAX refuses
+    them inside of another. An option that the installed compiler does not know is left out with a warning.
+    `many_small_kernels` asks for what compiles those sooner.
+    """
+    device = jax.devices()[0] if device is None else device
+    if device.platform != "cpu":
+        return jax.jit(function, **options)
+    wanted = dict(WIDE_VECTOR_OPTIONS)
+    if many_small_kernels and jax.__version_info__ < (0, 11):
+        wanted |= OLDER_EMITTER_OPTIONS
+    known = {name: value for name, value in wanted.items() if _is_known_option(name, value)}
+    return jax.jit(function, compiler_options=known or None, **options)
+
+
+@functools.cache
+def _is_known_option(name: str, value: int | bool) -> bool:
+    """Whether the compiler takes an option, found once by compiling a program without operations (15 ms)."""
+    try:
+        probe = jax.jit(lambda x: x, compiler_options={name: value})
+        probe.lower(jax.ShapeDtypeStruct((), jnp.float32)).compile()
+    except jax.errors.JaxRuntimeError as error:
+        warnings.warn(
+            f"jax {jax.__version__} does not take the compiler option {name}={value}: {error}. Runs are as right without "
+            "it, but may be slower.",
+            stacklevel=2,
+        )
+        return False
+    return True

@@ -4,16 +4,19 @@ Values are looked at only where they are concrete. Inside `jit`, `vmap` and `gra
 a bad value there becomes a status of the run (`Trajectory.ok`), never an exception.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Float
+
+NestedArrayLike = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
+"""What users give for numbers: a number, an array, or lists of them."""
 
 
 def concrete_or_none(value: Any) -> np.ndarray | None:
@@ -134,6 +137,27 @@ class Quantity(NamedTuple):
         if self.at_most is not None:
             good = good & (value <= self.at_most)
         return good
+
+
+if TYPE_CHECKING:
+    # To a type checker these are descriptors: a field is given numbers of any kind, and read as the array that `quantity`
+    # has converted them to. Checkers know of `converter=` only where it is written in the class itself.
+
+    class Numbers:
+        """The annotation of a field made with `quantity`: any numbers are given, an array is read."""
+
+        def __get__(self, instance: object, owner: type | None = None) -> Array: ...
+        def __set__(self, instance: object, value: NestedArrayLike) -> None: ...
+
+    class OptionalNumbers:
+        """The same where None means absent."""
+
+        def __get__(self, instance: object, owner: type | None = None) -> Array | None: ...
+        def __set__(self, instance: object, value: NestedArrayLike | None) -> None: ...
+
+else:
+    Numbers = Float[Array, "..."]
+    OptionalNumbers = Float[Array, "..."] | None
 
 
 def quantity(

@@ -1,32 +1,33 @@
-"""Where a run first crosses a surface: sought among its frames, then stepped to, to the accuracy of its method.
+"""Where a run first crosses a surface: bracketed by its frames, then by its steps, to the accuracy of its method.
 
-Between two frames the run is stepped again from the first of them, so that it does not matter how few were saved. The
+Between two frames the run is stepped again from the first of them, so the result does not depend on how many were saved. The
 moment within the step is a root along the method's own path; it moves with every number that the run depends on.
 """
 
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import any_lane
 from physjax.checks import quantity
 from physjax.closures import warn_of_recompilation
-from physjax.loops import Moment, moment_at, repeat_steps, to_float_time
+from physjax.cubics import Cubic
+from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
 from physjax.particles import append_axes, demand_particles
 from physjax.parts import as_module
 from physjax.roots import find_first_root
 from physjax.vectors import norm
 
 NODES_PER_BATCH = 64
-"""Nodes of a coupled scene whose crossings are sought at once, each with a copy of the scene."""
+"""Nodes of a coupled scene whose crossings are searched at once, each with a copy of the scene: a bound on memory."""
 
 
 class Crossing(NamedTuple):
@@ -44,34 +45,43 @@ class Height(eqx.Module):
     height: Float[Array, "..."] = quantity("height", "m")
     up: int = eqx.field(static=True, default=1)
 
-    def signed_distance(self, t: Any, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
-        """How far above [m]."""
+    def signed_distance(self, t: Time, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
+        """Height above it [m]."""
         return position[..., self.up] - self.height.astype(position.dtype)
 
 
+@runtime_checkable
+class Distanced(Protocol):
+    """A surface that knows the signed distance to it: a contact shape, a height, or one of the user's own."""
+
+    def signed_distance(self, t: Time, position: Array) -> Array:
+        """Signed distance of each lane [m]."""
+        ...
+
+
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
-def find_first_crossing(run: Any, surface: Any, direction: int | None) -> Crossing:
+def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
-    demand_particles("crossing", run.scene.state, "of bodies record the gap instead")
+    demand_particles("crossing", run.scene.state, "for bodies, record the signed distance instead")
     if direction not in (None, 1, -1):
         raise ValueError(
-            f"direction: got {direction!r}, expected +1 (from negative gaps to positive: upward), -1 (downward) or None."
+            f"direction: got {direction!r}, expected +1 (from negative to positive: upward), -1 (downward) or None."
         )
-    if not hasattr(surface, "signed_distance"):
+    if not isinstance(surface, Distanced):
         warn_of_recompilation("crossing", [surface])
         surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
     return _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
 
 
 @eqx.filter_jit
-def _find_crossings(run: Any, surface: Any, way: Array) -> Crossing:
+def _find_crossings(run: PyTree, surface: PyTree, way: Array) -> Crossing:
     find = lambda run: _find_run_crossings(run, surface, way)  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
         find = jax.vmap(find)
     return find(run)
 
 
-def _find_run_crossings(run: Any, surface: Any, way: Array) -> Crossing:
+def _find_run_crossings(run: PyTree, surface: PyTree, way: Array) -> Crossing:
     scene, signed_distance = run.scene, _get_distance_function(surface, run.scene)
     if not (scene.couples and scene.state.lanes):  # one ball is tied to nobody, whatever its forces say
         return _find_unit_crossings(run, signed_distance, way, lambda leaf: leaf)
@@ -88,7 +98,7 @@ def _find_run_crossings(run: Any, surface: Any, way: Array) -> Crossing:
 
 
 class _CrossingStep(NamedTuple):
-    """Where a crossing was found: in the step that begins so many steps after a frame; the gaps at both its ends."""
+    """The step in which a crossing was found, counted from a frame, and the signed distances at both its ends."""
 
     frame: Array
     step: Array
@@ -98,12 +108,12 @@ class _CrossingStep(NamedTuple):
 
 
 class _Replay(NamedTuple):
-    """A run to be stepped again: what changes in it at every frame, its step, its clock and its gap as functions.
+    """A run to be stepped again: what changes in it at every frame, with its step and its signed distance as functions.
 
     Every number has the shape of what is stepped on its own: a lane, or a scene of coupled ones.
     """
 
-    frames: Any
+    frames: PyTree
     step: Callable
     signed_distance: Callable
     first_step: Array
@@ -111,7 +121,7 @@ class _Replay(NamedTuple):
     dt: Array
 
     def stop_gradients(self) -> "_Replay":
-        """The same without derivatives."""
+        """The replay without derivatives."""
         moving = self.take_frame(jnp.zeros(self.dt.shape, jnp.int32))
         step = _stop_closure_gradients(self.step, moving, self.moment(jnp.zeros(self.dt.shape, jnp.int32), 0), self.dt)
         signed_distance = _stop_closure_gradients(self.signed_distance, self.dt, moving.state.position)
@@ -125,22 +135,22 @@ class _Replay(NamedTuple):
         )
 
     def moment(self, frame: Array, i: ArrayLike) -> Moment:
-        """When the step begins that comes i steps after a frame."""
+        """The moment at which step i after a frame begins."""
         return moment_at(self.first_step + frame * self.steps_per_frame + i, self.dt, self.dt.dtype)
 
-    def take_frame(self, frame: Array) -> Any:
-        """What changes, as it was at a frame of its own for each lane."""
+    def take_frame(self, frame: Array) -> PyTree:
+        """What changes, for each lane at a frame of its own."""
         return jax.tree.map(lambda leaf: _take_frames(leaf, frame), self.frames)
 
-    def measure_distance(self, t: Array, moving: Any) -> Array:
-        """The gap; zero where it is less than rounding, or what starts on the surface would cross it at once."""
+    def measure_distance(self, t: Array, moving: PyTree) -> Array:
+        """The signed distance, zero within rounding: a lane that starts on the surface does not cross it at once."""
         value, x = self.signed_distance(t, moving.state.position), moving.state.position
         size = jnp.broadcast_to(norm(x), value.shape) if x.ndim == value.ndim + 1 else jnp.max(norm(x), axis=-1)
         return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(x.dtype).eps) * size, 0.0, value)
 
 
-def _find_unit_crossings(run: Any, signed_distance: Callable, way: Array, own: Callable) -> Crossing:
-    """The first crossing of every lane, or, where they are coupled, of one node in every scene, which `own` picks."""
+def _find_unit_crossings(run: PyTree, signed_distance: Callable, way: Array, own: Callable) -> Crossing:
+    """The first crossing of every lane or, in a coupled scene, of the node in every scene that `own` picks."""
     replay = _build_replay(run, signed_distance)
     place = _find_crossing_step(replay.stop_gradients(), way)
     moving = replay.take_frame(place.frame)
@@ -163,16 +173,16 @@ def _find_unit_crossings(run: Any, signed_distance: Callable, way: Array, own: C
     tolerance = 4 * float(jnp.finfo(replay.dt.dtype).eps) * replay.dt
     values = (side * place.before, side * place.after)
     search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
-    duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))
+    duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))  # pyright: ignore[reportCallIssue]  # a custom derivative hides its signature
     x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
     reported = lambda leaf: jnp.where(append_axes(place.found, leaf), leaf, jnp.nan)  # noqa: E731
     return Crossing(reported(to_float_time(begun + duration)), reported(x), reported(v), place.found)
 
 
-def _build_replay(run: Any, signed_distance: Callable) -> _Replay:
-    """The run made ready to be stepped again."""
+def _build_replay(run: PyTree, signed_distance: Callable) -> _Replay:
+    """The run as a replay: what changes at its frames, and how it is stepped."""
     scene, film, shape = run.scene, run.film, run.scene.status_shape
-    changes = jax.tree.map(lambda a, b: a.ndim < b.ndim, scene, film)
+    changes = scene.changing()
     frames, (first, still) = eqx.filter(film, changes), eqx.partition(scene, changes)
     _demand_unshared_memory(first, shape)
     dt = jnp.broadcast_to(run.dt, shape)
@@ -184,7 +194,7 @@ def _build_replay(run: Any, signed_distance: Callable) -> _Replay:
 
 
 def _find_crossing_step(replay: _Replay, way: Array) -> _CrossingStep:
-    """Frame and step of the first crossing, by stepping again through the frames between which there may be one."""
+    """Frame and step of the first crossing, by stepping again between the frames that may bracket one."""
     shape, zero = replay.dt.shape, jnp.zeros(replay.dt.shape, jnp.int32)
     candidates = _find_candidate_intervals(replay, way)
     numbers = jnp.arange(len(candidates), dtype=jnp.int32).reshape(-1, *(1 for _ in shape))
@@ -207,7 +217,7 @@ def _find_crossing_step(replay: _Replay, way: Array) -> _CrossingStep:
 
 
 def _search_interval(replay: _Replay, frame: Array, way: Array) -> _CrossingStep:
-    """The first step after a frame at whose end the gap has another sign than at its start."""
+    """The first step after a frame over which the signed distance changes its sign."""
 
     def one(i, carry):
         moving, before, place = carry
@@ -231,7 +241,7 @@ def _search_interval(replay: _Replay, frame: Array, way: Array) -> _CrossingStep
 
 
 def _find_candidate_intervals(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:
-    """Between which frames there may be a crossing: where the cubic through them changes its sign, which may be at neither."""
+    """Between which frames there may be a crossing: where the cubic through them changes sign, if only in between."""
 
     def gap_and_rate(frame, moving):
         t, one = to_float_time(replay.moment(jnp.full(replay.dt.shape, frame), 0)), jnp.ones_like(replay.dt)
@@ -241,29 +251,28 @@ def _find_candidate_intervals(replay: _Replay, way: Array) -> Bool[Array, "inter
     numbers = jnp.arange(len(replay.frames.state.position), dtype=jnp.int32)
     signed_distance, rate = jax.vmap(gap_and_rate)(numbers, replay.frames)
     d0, d1, r0, r1 = signed_distance[:-1], signed_distance[1:], rate[:-1], rate[1:]
-    b, a = 3 * (d1 - d0) - 2 * r0 - r1, r0 + r1 - 2 * (d1 - d0)
-    root = b + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(b * b - 3 * a * r0, 0.0))
-    # the two places where it is level, by quotients that do not cancel; what is no number there is no place
-    level = [jnp.clip(jnp.nan_to_num(s, nan=1.0), 0.0, 1.0) for s in (-root / (3 * a), -r0 / root)]
-    middle = [d0 + s * (r0 + s * (b + s * a)) for s in (jnp.minimum(*level), jnp.maximum(*level))]
+    cubic = Cubic.through(d0, d1, r0, r1)
+    # an extremum that does not exist is moved to the end of the interval, where it divides nothing
+    level = [jnp.clip(jnp.nan_to_num(s, nan=1.0), 0.0, 1.0) for s in cubic.extrema()]
+    middle = [cubic.at(s) for s in (jnp.minimum(*level), jnp.maximum(*level))]
     ends = [d0, *middle, d1]
     pieces = [_crosses(before, after, way) for before, after in pairwise(ends)]
     return jnp.any(jnp.stack([_crosses(d0, d1, way), *pieces]), axis=0)
 
 
 def _crosses(before: Array, after: Array, way: Array) -> Array:
-    """Whether a gap changes its sign in the wanted direction; what starts at zero does not cross, what arrives there does."""
+    """Whether a signed distance changes its sign in the wanted direction; starting at zero is no crossing, arriving there is."""
     falls, rises = (before > 0) & (after <= 0), (before < 0) & (after >= 0)
     return (falls & (way <= 0)) | (rises & (way >= 0))
 
 
-def _stop_closure_gradients(function: Callable, *examples: Any) -> Callable:
-    """The function without derivatives by what it closes over."""
+def _stop_closure_gradients(function: Callable, *examples: PyTree) -> Callable:
+    """The function without derivatives with respect to what it closes over."""
     numbers, pure = _hoist_closure(function, *examples)
     return partial(pure, lax.stop_gradient(numbers))
 
 
-def _hoist_closure(function: Callable, *examples: Any) -> tuple[Any, Callable]:
+def _hoist_closure(function: Callable, *examples: PyTree) -> tuple[PyTree, Callable]:
     """Every array that a function closes over, and the function with these as its first argument."""
     numbers, rest = eqx.partition(
         eqx.filter_closure_convert(lambda *arguments: function(*arguments), *examples), eqx.is_array
@@ -272,30 +281,30 @@ def _hoist_closure(function: Callable, *examples: Any) -> tuple[Any, Callable]:
 
 
 def _take_frames(leaf: Array, frame: Array) -> Array:
-    """The entry of each lane at a frame of its own."""
+    """The entry of each lane, at a frame of its own."""
     if not frame.ndim:
         return leaf[frame]
     index = frame.reshape(1, *frame.shape, *(1 for _ in range(leaf.ndim - 1 - frame.ndim)))
     return jnp.take_along_axis(leaf, index, axis=0)[0]
 
 
-def _get_distance_function(surface: Any, scene: Any) -> Callable:
-    """The surface's gap, if it gives a number for each lane."""
-    signed_distance = getattr(surface, "signed_distance", surface)
+def _get_distance_function(surface: PyTree, scene: PyTree) -> Callable:
+    """The signed distance to the surface, if it gives a number for each lane."""
+    signed_distance = surface.signed_distance if isinstance(surface, Distanced) else surface
     t = jnp.zeros(scene.status_shape, scene.state.dtype)
     seen = jax.eval_shape(signed_distance, t, scene.state.position)
     if seen.shape != scene.state.lanes:
         raise ValueError(
-            f"crossing: the surface's gap(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
+            f"crossing: signed_distance(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
             "one distance [m] for each, e.g. position[..., 1] - 2.0."
         )
     return signed_distance
 
 
-def _demand_unshared_memory(changing: Any, shape: tuple[int, ...]) -> None:
+def _demand_unshared_memory(changing: PyTree, shape: tuple[int, ...]) -> None:
     """Raise a ValueError if lanes share something that changes: they are stepped from different frames."""
     if any(leaf.shape[: len(shape)] != shape for leaf in jax.tree.leaves(changing)):
         raise ValueError(
             "crossing: a part of the scene remembers something that its lanes share, but each lane is stepped again from a "
-            "frame of its own. Give what it remembers an entry for each lane, or run the lanes one by one."
+            "frame of its own. Give its memory an entry for each lane, or run the lanes one by one."
         )

@@ -3,32 +3,40 @@
 import os
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from physjax.checks import NestedArrayLike
 from physjax.mesh_files import Polygons, read_obj, read_ply
 
 _READERS = {".obj": read_obj, ".ply": read_ply}
 _TRIMESH_SUFFIXES = (".stl", ".glb", ".gltf")
-"""Endings of files that trimesh reads, where it is installed."""
+"""Suffixes of the files that are read by trimesh, where it is installed."""
 WELD_DISTANCE_SHARE = 1e-6
-"""Vertices that are nearer than this, relative to the size of a mesh, are one, unless an edge is as short."""
+"""Vertices closer to each other than this share of the size of a mesh are one [1]: float32 files round to a tenth of it."""
+SHORTEST_EDGE_SHARE = WELD_DISTANCE_SHARE**2
+"""Edges shorter than this share of the size of a mesh join two copies of a vertex and are no edges [1]."""
+NEAR_PIECE_SHARE = 0.1
+"""Pieces of a mesh that come closer than this share of its shortest edge were most likely one [1]."""
+TURNED_TRIANGLE_SHARE = 1e-6
+"""A fan may have triangles turned over by less than this share of its area squared [1]: those of collinear corners."""
 
 
 def read_mesh(path: str | os.PathLike, *, triangulate: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Vertices `(n, 3)` and triangles `(m, 3)` of an .obj or .ply file; with trimesh also .stl, .glb and .gltf.
 
-    With `triangulate` faces of more corners are cut into triangles, fans around their first corner that sees all the others,
-    and refused where there is none; without it all of them are refused.
-    What trimesh reads is welded, since STL never and GLB seldom shares vertices. Raises FileNotFoundError, ImportError
-    without trimesh, or ValueError for a file that is truncated, not a mesh, or not understood in full.
+    With `triangulate`, faces of more than three corners are cut into triangles: fans around their first corner that sees
+    all others. Files that trimesh reads are welded, since STL never and GLB seldom shares vertices between faces. Raises
+    FileNotFoundError, ImportError without trimesh, or ValueError for a file that is truncated, not a mesh, not understood
+    in full, or with faces that are not triangles and cannot be cut.
     """
     file = Path(path)
     ending = file.suffix.lower()
     if ending not in _READERS and ending not in _TRIMESH_SUFFIXES:
         raise ValueError(
-            f"mesh: got {file.name}, expected a file that ends in {' or '.join(_READERS)}, or with trimesh {', '.join(_TRIMESH_SUFFIXES)}."
+            f"mesh: got {file.name}, expected a file that ends in {' or '.join(_READERS)}, or with trimesh "
+            f"{', '.join(_TRIMESH_SUFFIXES)}."
         )
     if not file.is_file():
         raise FileNotFoundError(f"mesh: there is no file {file}.")
@@ -39,8 +47,10 @@ def read_mesh(path: str | os.PathLike, *, triangulate: bool = False) -> tuple[np
     return check_mesh(vertices, _triangulate(file.name, vertices, polygons), file.name)
 
 
-def check_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles as arrays, or a ValueError that says what is wrong with them."""
+def check_mesh(
+    vertices: NestedArrayLike, faces: NestedArrayLike | None, name: str = "mesh"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices `(n, 3)` and triangles `(m, 3)` as arrays, or a ValueError that says what is wrong with them."""
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.dtype.kind not in "iuf":
         raise ValueError(f"{name}: got vertices of shape {vertices.shape}, expected numbers of shape (vertices, 3).")
@@ -65,9 +75,9 @@ def check_mesh(vertices: Any, faces: Any, name: str = "mesh") -> tuple[np.ndarra
 
 
 class WeldedMesh(NamedTuple):
-    """Vertices and triangles without vertices that stand in one place; `index[i]` is the vertex that i has become.
+    """A mesh without coinciding vertices: `index[i]` is the new number of vertex i.
 
-    `flat` triangles had two corners in one place and are left out.
+    `flat` is the number of triangles with two coinciding corners, which are left out.
     """
 
     vertices: np.ndarray
@@ -76,38 +86,37 @@ class WeldedMesh(NamedTuple):
     flat: int
 
 
-def weld(vertices: Any, faces: Any, tolerance: float | None = None) -> WeldedMesh:
-    """One vertex instead of several that are nearer than `tolerance` [m]; the first of them stays, in its order.
+def weld(vertices: NestedArrayLike, faces: NestedArrayLike, tolerance: float | None = None) -> WeldedMesh:
+    """The mesh with vertices joined that are closer to each other than `tolerance` [m]; the first of each group is kept.
 
-    Unless told, that is a millionth of the mesh's size, or a tenth of its shortest edge where that is less.
+    The default is a millionth of the size of the mesh, or a tenth of its shortest edge where that is less.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    vertices, faces = check_mesh(vertices, faces)
-    count = len(vertices)
+    x, triangles = check_mesh(vertices, faces)
+    count = len(x)
     if tolerance is None:
-        edges = np.sqrt(((vertices[faces] - vertices[np.roll(faces, 1, axis=1)]) ** 2).sum(axis=-1))
-        size = np.sqrt((np.ptp(vertices, axis=0) ** 2).sum())
-        tolerance = min(
-            WELD_DISTANCE_SHARE * size, edges[edges > WELD_DISTANCE_SHARE**2 * size].min(initial=np.inf) / 10
-        )
-    pairs = KDTree(vertices).query_pairs(tolerance, output_type="ndarray")
+        edges = np.sqrt(((x[triangles] - x[np.roll(triangles, 1, axis=1)]) ** 2).sum(axis=-1))
+        size = np.sqrt((np.ptp(x, axis=0) ** 2).sum())
+        tolerance = min(WELD_DISTANCE_SHARE * size, edges[edges > SHORTEST_EDGE_SHARE * size].min(initial=np.inf) / 10)
+    pairs = KDTree(x).query_pairs(tolerance, output_type="ndarray")
     _, group = connected_components(coo_array((np.ones(len(pairs)), pairs.T), (count, count)), directed=False)
+    # renumbered by first occurrence, so that a mesh without coinciding vertices keeps its order
     _, first, group = np.unique(group, return_index=True, return_inverse=True)
     place = np.empty_like(first)
     place[np.argsort(first)] = np.arange(len(first))
     index = place[group.reshape(-1)]
-    joined = index[faces]
+    joined = index[triangles]
     flat = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
-    return WeldedMesh(vertices[np.sort(first)], joined[~flat], index, int(flat.sum()))
+    return WeldedMesh(x[np.sort(first)], joined[~flat], index, int(flat.sum()))
 
 
 def find_near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, float]:
-    """How many pieces, which share no vertex, come within a tenth of the shortest edge of another, and how near [m].
+    """The number of pieces that share no vertex but come within a tenth of the shortest edge of another, and how close [m].
 
-    (0, inf) where none do. Such a mesh is most often one whose vertices were rounded differently from face to face.
+    (0, inf) if there are none. In such a mesh vertices were most likely rounded differently from face to face.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -118,7 +127,7 @@ def find_near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, floa
     if not piece[faces].any():
         return 0, np.inf
     edges = np.sqrt(((vertices[ends[0]] - vertices[ends[1]]) ** 2).sum(axis=-1))
-    pairs = KDTree(vertices).query_pairs(edges.min() / 10, output_type="ndarray")
+    pairs = KDTree(vertices).query_pairs(edges.min() * NEAR_PIECE_SHARE, output_type="ndarray")
     pairs = pairs[piece[pairs[:, 0]] != piece[pairs[:, 1]]]
     if not len(pairs):
         return 0, np.inf
@@ -127,16 +136,15 @@ def find_near_pieces(vertices: np.ndarray, faces: np.ndarray) -> tuple[int, floa
 
 
 def _triangulate(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndarray:
-    """Faces as triangles: those of more corners as fans around their first corner that sees all the others."""
+    """Faces as triangles: those with more corners as fans around their first corner that sees all others."""
     if all(len(polygon) == 3 for polygon in polygons):
         return np.array(polygons, np.int64)
     lengths, fans = np.array([len(polygon) for polygon in polygons]), list(polygons)
     for length in np.unique(lengths[lengths > 3]):
         which = np.flatnonzero(lengths == length)
         corners = np.array([polygons[i] for i in which], np.int64)
-        known = ((corners >= 0) & (corners < len(vertices))).all(
-            axis=1
-        )  # others are refused with triangles of their kind
+        # indices out of range are refused later, by the check that triangles go through
+        known = ((corners >= 0) & (corners < len(vertices))).all(axis=1)
         begun = _find_fan_starts(vertices[corners[known]])
         if (begun < 0).any():
             first = which[known][int(np.argmax(begun < 0))]
@@ -149,10 +157,10 @@ def _triangulate(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndar
 
 
 def _find_fan_starts(places: np.ndarray) -> np.ndarray:
-    """The first corner of each polygon `(polygons, corners, 3)` whose fan has no triangle turned over; -1 without one."""
+    """The first corner of each polygon `(polygons, corners, 3)` whose fan has no triangle turned over; -1 if there is none."""
     away = places - places[:, :1]
     normal = np.cross(away, np.roll(away, -1, axis=1)).sum(axis=1)
-    least = -1e-6 * (normal**2).sum(axis=1)  # of four corners in a line, by rounding
+    least = -TURNED_TRIANGLE_SHARE * (normal**2).sum(axis=1)
     starts = np.full(len(places), -1)
     for start in reversed(range(places.shape[1])):
         away = np.roll(places, -start, axis=1)[:, 1:] - places[:, start, None]
@@ -172,7 +180,7 @@ def _read_with_trimesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         mesh = trimesh.load_mesh(file, process=False)
         vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # of many kinds, none of which is for its callers
+    except Exception as error:  # trimesh raises many kinds; callers get one
         raise ValueError(f"{file.name}: trimesh cannot read it ({type(error).__name__}: {error}).") from error
     if not len(faces):
         raise ValueError(f"{file.name}: found {len(vertices)} vertices and no faces, expected a mesh.")
@@ -180,12 +188,12 @@ def _read_with_trimesh(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _demand_whole_stl(file: Path) -> None:
-    """Raise a ValueError for an STL file that is cut short, of which trimesh reads what is left."""
+    """Raise a ValueError for a truncated STL file, which trimesh would read without complaint."""
     content = file.read_bytes()
     stated = int.from_bytes(content[80:84], "little")
     if len(content) == 84 + 50 * stated:
         return
-    # a solid may have any name
+    # a solid may have any name, also one that contains keywords
     unnamed = re.sub(rb"(?m)^([ \t]*(?:end)?solid)\b(?!.*\bfacet\s+normal\b).*", rb"\1", content.lower())
     words = re.findall(rb"\b(endfacet|vertex|endsolid|facet|solid)\b", unnamed)
     facets, corners = words.count(b"facet"), words.count(b"vertex")

@@ -1,11 +1,13 @@
 """Point masses, the state of most scenes, and what a scene asks of any record of moving things."""
 
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from physjax.checks import as_real_array, as_real_quantity
 from physjax.loops import Time, time_for_part, to_float_time
@@ -31,7 +33,7 @@ class StateRecord(Protocol):
         ...
 
     @property
-    def place(self) -> Any:
+    def place(self) -> PyTree:
         """What the errors of a path are measured by."""
         ...
 
@@ -40,43 +42,43 @@ class StateRecord(Protocol):
         """Whether it has an orientation."""
         ...
 
-    def validate(self, mass: Any) -> tuple[Any, Any]:
+    def validate(self, mass: PyTree) -> tuple[PyTree, PyTree]:
         """State and mass as arrays that fit; ValueError or TypeError otherwise."""
         ...
 
-    def view_for_force(self, force: Any, mass: Any) -> tuple[Any, Any]:
+    def view_for_force(self, force: Callable, mass: PyTree) -> tuple[PyTree, PyTree]:
         """The state and the mass that a force sees."""
         ...
 
-    def evaluate_load(self, force: Any, t: Time, mass: Any) -> Any:
+    def evaluate_load(self, force: Callable, t: Time, mass: PyTree) -> PyTree:
         """What a force does to each lane."""
         ...
 
-    def sum_loads(self, terms: Any) -> Any:
+    def sum_loads(self, terms: PyTree) -> PyTree:
         """The sum of loads."""
         ...
 
-    def generalised_force(self, scene: Any, t: Time) -> Any:
+    def generalised_force(self, scene: PyTree, t: Time) -> PyTree:
         """All that changes the velocities in a scene at the time t [s]."""
         ...
 
-    def rate(self, loads: Any, mass: Any) -> Any:
+    def rate(self, loads: PyTree, mass: PyTree) -> PyTree:
         """Time derivative under these loads."""
         ...
 
-    def kick(self, rate: Any, dt: ArrayLike) -> Any:
+    def kick(self, rate: PyTree, dt: ArrayLike) -> PyTree:
         """Velocities changed by `rate` for a time dt [s]."""
         ...
 
-    def drift(self, dt: ArrayLike, mass: Any) -> Any:
+    def drift(self, dt: ArrayLike, mass: PyTree) -> PyTree:
         """Places moved by the velocities for a time dt [s]."""
         ...
 
-    def normalised(self, mass: Any) -> Any:
+    def normalised(self, mass: PyTree) -> PyTree:
         """The state as it must be after a step."""
         ...
 
-    def hold_lanes(self, free: Array) -> Any:
+    def hold_lanes(self, free: Array) -> PyTree:
         """The state with held lanes (free = 0) at rest."""
         ...
 
@@ -111,23 +113,23 @@ class Particles(NamedTuple):
         """What the errors of a path are measured by: the position [m]."""
         return self.position
 
-    def view_for_force(self, force: Any, mass: Float[Array, "..."]) -> tuple["Particles", Float[Array, "..."]]:
+    def view_for_force(self, force: Callable, mass: Float[Array, "..."]) -> tuple["Particles", Float[Array, "..."]]:
         """The state and the mass that a force sees."""
         return self, mass
 
-    def evaluate_load(self, force: Any, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def evaluate_load(self, force: Callable, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """What a force does to each lane [N], shaped like the velocity; seen once, while tracing."""
         return check_load_shape(force, force(time_for_part(force, t), self, mass), self.velocity)
 
-    def evaluate_field(self, field: Any, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+    def evaluate_field(self, field: Callable, t: Time, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The acceleration that a field gives to each lane [m/s²]."""
         return check_load_shape(field, field.acceleration(time_for_part(field, t), self, mass), self.velocity)
 
-    def sum_loads(self, terms: Any) -> Float[Array, "*lanes dim"]:
+    def sum_loads(self, terms: Sequence[Array]) -> Float[Array, "*lanes dim"]:
         """The sum of loads [N]."""
         return sum_terms(terms) if terms else jnp.zeros_like(self.velocity)
 
-    def generalised_force(self, scene: Any, t: Time) -> Float[Array, "*lanes dim"]:
+    def generalised_force(self, scene: PyTree, t: Time) -> Float[Array, "*lanes dim"]:
         """Newton's second law, a = ΣF/m [m/s²]: fields first, so that a falling body never looks its mass up.
 
         Held lanes do not accelerate, kinematic ones as their path does; what rests on a surface is held by its reaction.
@@ -148,7 +150,7 @@ class Particles(NamedTuple):
             acceleration = motion.prescribe_acceleration(to_float_time(t), state, acceleration)
         return acceleration if scene.reaction is None else scene.reaction(to_float_time(t), state, acceleration)
 
-    def rate(self, acceleration: Float[Array, "*lanes dim"], mass: Any = None) -> "Particles":
+    def rate(self, acceleration: Float[Array, "*lanes dim"], mass: PyTree = None) -> "Particles":
         """Time derivative: position changes with the velocity, velocity with the acceleration."""
         return Particles(self.velocity, acceleration)
 
@@ -156,7 +158,7 @@ class Particles(NamedTuple):
         """v += a dt, the position untouched."""
         return Particles(self.position, self.velocity + scale(dt, rate.velocity))
 
-    def drift(self, dt: ArrayLike, mass: Any = None) -> "Particles":
+    def drift(self, dt: ArrayLike, mass: PyTree = None) -> "Particles":
         """x += v dt, the velocity untouched."""
         return Particles(self.position + scale(dt, self.velocity), self.velocity)
 
@@ -165,7 +167,7 @@ class Particles(NamedTuple):
         """Points do not rotate."""
         return False
 
-    def normalised(self, mass: Any = None) -> "Particles":
+    def normalised(self, mass: PyTree = None) -> "Particles":
         """The state itself: its arrays need not agree with each other."""
         return self
 
@@ -181,7 +183,7 @@ class Particles(NamedTuple):
         """mv [kg m/s]."""
         return scale(mass, self.velocity)
 
-    def validate(self, mass: Any) -> tuple["Particles", Float[Array, "..."]]:
+    def validate(self, mass: PyTree) -> tuple["Particles", Float[Array, "..."]]:
         """State and mass as floating-point arrays of one dtype that fit; ValueError or TypeError in plain words otherwise."""
         state = Particles(as_real_array("position", self.position), as_real_array("velocity", self.velocity))
         x, v = state
@@ -210,7 +212,12 @@ class Particles(NamedTuple):
         return state, mass
 
 
-def demand_state_record(state: Any) -> None:
+def callable_name(part: object) -> str:
+    """What a force or a method is called in sentences: its class, or the name of the function that it is."""
+    return getattr(getattr(part, "function", part), "__name__", type(part).__name__)
+
+
+def demand_state_record(state: object) -> None:
     """Raise a TypeError for a state that is no record of moving things."""
     if not hasattr(type(state), "validate"):
         raise TypeError(
@@ -219,13 +226,13 @@ def demand_state_record(state: Any) -> None:
         )
 
 
-def demand_particles(what: str, state: Any, why: str) -> None:
+def demand_particles(what: str, state: object, why: str) -> None:
     """Raise a TypeError for a state of another kind, where something is done with particles only."""
     if not isinstance(state, Particles):
         raise TypeError(f"{what}: got a state of type {type(state).__name__}, expected Particles: {why}.")
 
 
-def sum_terms(terms: Any) -> Array:
+def sum_terms(terms: Sequence[Array]) -> Array:
     """The sum of arrays, in order."""
     total, *others = terms
     for term in others:
@@ -233,12 +240,13 @@ def sum_terms(terms: Any) -> Array:
     return total
 
 
-def check_load_shape(force: Any, value: Any, expected: Array) -> Array:
+def check_load_shape(force: Callable, value: object, expected: Array) -> Array:
     """The value of a force, if it is shaped as expected, like the velocity; a TypeError in plain words otherwise."""
-    shape, dtype = getattr(value, "shape", ()), getattr(value, "dtype", type(value))
-    if shape == expected.shape and dtype == expected.dtype:
+    shape = value.shape if isinstance(value, jax.Array | np.ndarray) else ()
+    dtype = value.dtype if isinstance(value, jax.Array | np.ndarray) else type(value)
+    if isinstance(value, jax.Array) and shape == expected.shape and dtype == expected.dtype:
         return value
-    name = getattr(getattr(force, "function", force), "__name__", type(force).__name__)
+    name = callable_name(force)
     raise TypeError(
         f"force {name}: got an array of shape {shape} and dtype {dtype}, expected {expected.shape} and {expected.dtype} "
         "like the velocity. Build it from state and mass, and keep other numbers Python floats or fields of a module."

@@ -1,16 +1,16 @@
-"""The parts of a scene: what a force and a contact are, and what becomes of them when a scene is built."""
+"""The parts of a scene: what a force and a contact can do, and how they are prepared when a scene is built."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import demand_start_outside
 from physjax.loops import Time
@@ -20,23 +20,23 @@ from physjax.vectors import scale
 
 
 class Function(eqx.Module):
-    """A plain function as part of a scene. It counts as coupling its lanes unless it is said to be independent."""
+    """A plain function as part of a scene. It counts as coupling lanes unless `forces.independent` says otherwise."""
 
     function: Callable = eqx.field(static=True)
     couples: bool = eqx.field(static=True, default=True)
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: PyTree) -> PyTree:
         """Call the function."""
         return self.function(*arguments)
 
 
-def as_module(function: Callable) -> eqx.Module:
+def as_module(function: Callable) -> PyTree:
     """A plain function wrapped so that it can travel in a pytree; modules are returned as they are."""
     return function if isinstance(function, eqx.Module) else Function(function)
 
 
-def find_plain_functions(part: Any) -> list[Function]:
-    """The plain functions in a part of a scene or a method, however deep: what they close over nobody can see."""
+def find_plain_functions(part: PyTree) -> list[Function]:
+    """The plain functions in a part of a scene or a method, however deep. What they close over cannot be seen."""
     is_plain = lambda node: isinstance(node, Function)  # noqa: E731
     return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
 
@@ -46,7 +46,12 @@ FORCE_OLD_NAMES = {
     "near": "linearised_at",
     "definite": "dissipative_symmetric",
 }
-CONTACT_OLD_NAMES = {"gap": "signed_distance", "answered": "resolve", "forgetting": "forget_lanes", "prepared": "prepare"}
+CONTACT_OLD_NAMES = {
+    "gap": "signed_distance",
+    "answered": "resolve",
+    "forgetting": "forget_lanes",
+    "prepared": "prepare",
+}
 """What abilities were called in the first edition."""
 
 
@@ -54,8 +59,8 @@ class Force(eqx.Module):
     """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
 
     `t` [s] is a scalar or one per lane. `couples` says whether a lane's force depends on other lanes. Numbers are fields
-    made with `quantity`. Everything below `__call__` is an ability that a force may have, with the default of one that
-    has it not: a conservative force gives its `potential`, one that jumps in time its mean (`averaged_over_step`) and its
+    made with `quantity`. Everything below `__call__` is an ability that a force may have, with the default of a force
+    that lacks it: a conservative force gives its `potential`, one that jumps in time its mean (`averaged_over_step`) and its
     `discontinuities`, one with memory how it `advance`s, one that depends on g or on which axis is up asks the scene
     (`under`).
 
@@ -75,7 +80,7 @@ class Force(eqx.Module):
     sees_moments: ClassVar[bool] = False
     """Whether it takes the time as a `Moment`, which keeps what one float32 cannot hold."""
 
-    def __init_subclass__(cls, **options: Any):
+    def __init_subclass__(cls, **options: object):
         super().__init_subclass__(**options)
         serve_old_names(cls, FORCE_OLD_NAMES)
 
@@ -83,7 +88,7 @@ class Force(eqx.Module):
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """Force on each lane [N]."""
 
-    def potential(self, t: ArrayLike, state: Any, mass: Any) -> Array | None:
+    def potential(self, t: ArrayLike, state: PyTree, mass: PyTree) -> Array | None:
         """Potential energy [J], shaped like the lanes (a shared energy is halved between its two lanes); None without one."""
         return None
 
@@ -92,7 +97,7 @@ class Force(eqx.Module):
         """Whether the force is conservative, with its `potential`."""
         return type(self).potential is not Force.potential
 
-    def averaged_over_step(self, t: Time, dt: ArrayLike, state: Any) -> "Force":
+    def averaged_over_step(self, t: Time, dt: ArrayLike, state: PyTree) -> "Force":
         """The force as a step from t to t + dt [s] sees it: one that jumps in time gives its mean."""
         return self
 
@@ -105,7 +110,7 @@ class Force(eqx.Module):
         """Times [s] at which the force jumps."""
         return ()
 
-    def linearised_at(self, t: Time, state: Any, mass: Any) -> "Force":
+    def linearised_at(self, t: Time, state: PyTree, mass: PyTree) -> "Force":
         """The force that an implicit step differentiates at this state in place of this one."""
         return self
 
@@ -114,7 +119,7 @@ class Force(eqx.Module):
         """Whether an implicit step differentiates another force than this one (`linearised_at`)."""
         return type(self).linearised_at is not Force.linearised_at
 
-    def advance(self, t: ArrayLike, dt: ArrayLike, state: Any) -> tuple["Force", Any]:
+    def advance(self, t: ArrayLike, dt: ArrayLike, state: PyTree) -> tuple["Force", PyTree]:
         """The force and the state after a step from t to t + dt [s] was taken, for one with memory: springs that break."""
         return self, state
 
@@ -130,11 +135,11 @@ class Force(eqx.Module):
         return axis if isinstance(axis, int) else None
 
     @property
-    def weight(self) -> tuple[Any, int] | None:
+    def weight(self) -> tuple[ArrayLike | None, int] | None:
         """g [m/s²] (None: not along an axis) and the axis that is up, of a force that is the weight; None of any other."""
         return None
 
-    def under(self, weight: tuple[Any, int]) -> "Force":
+    def under(self, weight: tuple[ArrayLike | None, int]) -> "Force":
         """The force in a scene with this weight: one that needs g and up takes them over, or refuses what it cannot."""
         return self
 
@@ -165,9 +170,9 @@ class Field(Force):
 
 
 class Contact(eqx.Module):
-    """Something that lanes may not pass. `respond(t, state)` answers every touch, once a step, at its end.
+    """Something that lanes may not pass. `respond(t, state)` resolves every contact at the end of a step.
 
-    A `response(motion, scene, t, dt) -> scene` other than `project` decides otherwise when touches are answered;
+    A `response(motion, scene, t, dt) -> scene` other than `project` decides when contacts are resolved instead;
     `memory` names the arrays that it changes.
 
     Example:
@@ -180,7 +185,7 @@ class Contact(eqx.Module):
     response: ClassVar[Callable | None] = None
     memory: ClassVar[tuple[str, ...]] = ()
 
-    def __init_subclass__(cls, **options: Any):
+    def __init_subclass__(cls, **options: object):
         super().__init_subclass__(**options)
         serve_old_names(cls, CONTACT_OLD_NAMES)
 
@@ -190,31 +195,35 @@ class Contact(eqx.Module):
 
     @abstractmethod
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
-        """The state after a touch; lanes that touch nothing stay as they are."""
+        """The state after contact; lanes that are not in contact stay as they are."""
+
+    def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray] | None:
+        """Polygons `(corners, 3)` [m] that show the surface in a box in space; None: they follow from the signed distance."""
+        return None
 
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
-        """The contact with what it remembers of some lanes forgotten, because others will be in their place."""
+        """The contact with the memory of some lanes cleared, because other particles take their place."""
         return self
 
-    def resolve(self, t: ArrayLike, state: Any, mass: Any) -> Any:
-        """What `project` takes: `respond`, unless an answer needs the masses."""
+    def resolve(self, t: ArrayLike, state: PyTree, mass: PyTree) -> PyTree:
+        """What `project` calls: `respond`, unless the response needs the masses."""
         return self.respond(t, state)
 
-    def clearance(self, t: ArrayLike, state: Any) -> Float[Array, "*lanes"]:
-        """How far each lane is from touching [m]."""
+    def clearance(self, t: ArrayLike, state: PyTree) -> Float[Array, "*lanes"]:
+        """How far each lane is from contact [m]."""
         return self.signed_distance(t, state.position)
 
-    def demand_fit(self, state: Any, mass: Any) -> None:
-        """Raise a TypeError for what cannot touch it, and a ValueError for lanes that start on the wrong side."""
-        demand_particles("contacts", state, "rigid bodies touch with rigid.Touch(hull, plane)")
+    def demand_fit(self, state: PyTree, mass: PyTree) -> None:
+        """Raise a TypeError for a state of another kind, and a ValueError for lanes that start on the wrong side."""
+        demand_particles("contacts", state, "rigid bodies need rigid.SurfaceContact(hull, plane)")
         demand_start_outside(self, state)
 
-    def prepare(self, state: Any, couples: bool) -> "Contact":
+    def prepare(self, state: PyTree, couples: bool) -> "Contact":
         """The contact as part of a scene whose lanes are coupled or not; one that remembers begins its memory here."""
         return self
 
 
-def build_memory_mask(part: Any) -> Any:
+def build_memory_mask(part: PyTree) -> PyTree:
     """A contact or an emitter with True in place of each array that its `memory` names, False elsewhere."""
     mask = jax.tree.map(lambda _: False, part)
     if part is None or not part.memory:
@@ -225,12 +234,26 @@ def build_memory_mask(part: Any) -> Any:
 serve_old_names(Contact, CONTACT_OLD_NAMES)
 
 
-def has_memory(part: Any) -> bool:
+class ParticleSource(eqx.Module):
+    """What lets the lanes of a scene be born and die within a step; `memory` names the arrays that this changes."""
+
+    memory: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def prepare(self, scene: PyTree) -> "ParticleSource":
+        """The source as part of this scene; the checks are here."""
+
+    @abstractmethod
+    def live(self, motion: Callable, scene: PyTree, t: Time, dt: ArrayLike) -> PyTree:
+        """The scene after a step, in which each lane moves from its birth, or the start, to its death, or the end."""
+
+
+def has_memory(part: PyTree) -> bool:
     """Whether a step changes arrays of this part of a scene, as well as the state."""
     return part is not None and (part.remembers if isinstance(part, Force) else bool(part.memory))
 
 
-def build_advance_mask(force: Force, state: Any, mass: Any) -> Any:
+def build_advance_mask(force: Force, state: PyTree, mass: PyTree) -> PyTree:
     """A force with True in place of each array that its `advance` replaces: found by tracing it and comparing identities."""
     if not force.remembers:
         return jax.tree.map(lambda _: False, force)
@@ -248,24 +271,24 @@ def build_advance_mask(force: Force, state: Any, mass: Any) -> Any:
 @cache
 def _adopt_class(cls: type) -> type:
     """The class of a user's force that is not derived from `Force`, with the defaults of `Force` for what it lacks."""
-    own = {} if hasattr(cls, "couples") else {"couples": True}  # what does not say may look at any lane
+    own = {} if hasattr(cls, "couples") else {"couples": True}  # one that does not say may depend on any lane
     names = {"__module__": cls.__module__, "__qualname__": cls.__qualname__, "__doc__": cls.__doc__}
     # with its own way to begin: a dataclass would make one in which a default of `Force` may stand before a field without one
     return type(cls)(cls.__name__, (cls, Force), own | names | {"__init__": cls.__init__})
 
 
-def adopt_force(part: Any) -> Force:
-    """Any callable as a `Force`: a plain function, or a module of the user's own with some of the abilities of one."""
-    part = as_module(part)
-    if isinstance(part, Force):
-        return part
-    adopted = object.__new__(_adopt_class(type(part)))
-    vars(adopted).update(vars(part))
+def adopt_force(part: Callable) -> Force:
+    """Any callable as a `Force`: a plain function, or a user's module with some of its abilities."""
+    module = as_module(part)
+    if isinstance(module, Force):
+        return module
+    adopted = object.__new__(_adopt_class(type(module)))
+    vars(adopted).update(vars(module))
     return adopted
 
 
 def unify_gravity(forces: list, dim: int) -> tuple:
-    """The forces, agreed about g and which axis of `dim` is up: those of `Gravity`, of several the sum."""
+    """The forces with one g and one axis of `dim` that is up: those of `Gravity`, with several of them the sum."""
     weights = [force.weight for force in forces if force.weight is not None]
     for _, up in weights:
         if up >= dim:
@@ -281,26 +304,26 @@ def unify_gravity(forces: list, dim: int) -> tuple:
     return tuple(force.under(weight) for force in forces)
 
 
-def as_tuple(kind: str, parts: Any) -> tuple:
+def as_tuple(kind: str, parts: object) -> tuple:
     """The parts as a tuple; a single one given without it is an easy slip and gets an error that says so."""
-    if callable(parts) or not hasattr(parts, "__iter__"):
+    if callable(parts) or not isinstance(parts, Iterable):
         raise TypeError(f"{kind}s: got {type(parts).__name__}, expected a tuple of {kind}s. Write {kind}s=({kind},).")
     return tuple(parts)
 
 
-def prepare_force(force: Any, dtype: np.dtype) -> Force:
+def prepare_force(force: Callable, dtype: np.dtype) -> Force:
     """A force as a pytree of arrays in the scene's dtype; a TypeError for what is none."""
     expected = "a force: a callable (t, state, mass) -> newtons"
     return _prepare_part("force", force, callable(force) and not isinstance(force, type), expected, dtype)
 
 
-def prepare_contact(contact: Any, dtype: np.dtype) -> Contact:
+def prepare_contact(contact: object, dtype: np.dtype) -> Contact:
     """A contact as a pytree of arrays in the scene's dtype; a TypeError for what is none."""
     expected = "a contact, e.g. contacts.Plane(point=(0, 0), normal=(0, 1))"
     return _prepare_part("contact", contact, isinstance(contact, Contact), expected, dtype)
 
 
-def _prepare_part(kind: str, part: Any, good: bool, expected: str, dtype: np.dtype) -> Any:
+def _prepare_part(kind: str, part: PyTree, good: bool, expected: str, dtype: np.dtype) -> PyTree:
     """A force or contact as a pytree of arrays whose floating-point numbers have the scene's dtype; a TypeError otherwise."""
     if not good:
         raise TypeError(f"{kind}s: got {type(part).__name__} {part!r}, expected {expected}.")
@@ -311,7 +334,7 @@ def _prepare_part(kind: str, part: Any, good: bool, expected: str, dtype: np.dty
     return jax.tree.map(cast, part)
 
 
-def _demand_array(part: Any, path: tuple, leaf: Any) -> None:
+def _demand_array(part: object, path: tuple, leaf: object) -> None:
     """Raise a TypeError for a leaf that a compiled program cannot take: only arrays and floats change from run to run."""
     if isinstance(leaf, jax.Array | np.ndarray | np.generic | float):
         return
@@ -328,8 +351,3 @@ def _demand_array(part: Any, path: tuple, leaf: Any) -> None:
         f"{name}: the field {field} holds a {kind}, expected an array or a float. What is no number is a part of the "
         "program: declare it with eqx.field(static=True)."
     )
-
-
-def callable_name(part: Any) -> str:
-    """What a force or a method is called in sentences: its class, or the name of the function that it is."""
-    return getattr(getattr(part, "function", part), "__name__", type(part).__name__)

@@ -1,16 +1,15 @@
-"""Lanes that no force moves because something else does: a hand that shakes a flag, the limb that drags a body."""
+"""Kinematic nodes: lanes whose motion is prescribed, such as the hand that shakes a flag or the limb that drags a body."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
+from physjax.backend import block_fusion
 from physjax.checks import concrete_or_none, unchecked_quantity
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
@@ -18,14 +17,14 @@ from physjax.vectors import components, stack_components
 
 
 class Pins(eqx.Module):
-    """Led lanes: `Scene(..., pinned=Pins(nodes, path))` moves the lanes of the mask `nodes` along `path(t)`.
+    """Prescribed motion: `Scene(..., pinned=Pins(nodes, path))` moves the lanes of the mask `nodes` along `path(t)`.
 
-    `path(t) -> positions` [m] of all lanes, `(*lanes, dim)` or broadcastable to it; only the rows of led lanes count.
-    Forces feel them where the path is at the moment they are asked, with the velocity of the path (its derivative), so
-    that a method keeps its order where the path is smooth; after each step they stand on it exactly. `t` [s] is a
+    `path(t) -> positions` [m] of all lanes, `(*lanes, dim)` or broadcastable to it; only the rows of `nodes` count.
+    Forces see the nodes on the path at the time of each evaluation, with the velocity of the path (its derivative), so
+    that a method keeps its order where the path is smooth; after each step the nodes are on the path exactly. `t` [s] is a
     scalar, or shaped to broadcast with the lanes where a run has many step sizes. Numbers of a path that is an
-    `equinox.Module` can be swept and differentiated; a plain function compiles anew for each new one. Led lanes must
-    start on the path: `state = pins.prescribe(0.0, state)`. Raises ValueError or TypeError otherwise.
+    `equinox.Module` can be swept and differentiated; a plain function recompiles for each new one. Kinematic nodes
+    must start on the path: `state = pins.prescribe(0.0, state)`. Raises ValueError or TypeError otherwise.
 
     Example:
         >>> hand = Pins(sheet.nodes["left"], path=lambda t: sheet.state.position + jnp.array([0.0, 2.0, 0.0]) * t)
@@ -34,10 +33,10 @@ class Pins(eqx.Module):
         [0. 1. 0.] [0. 2. 0.]
     """
 
-    nodes: Bool[Array, "*lanes"] = unchecked_quantity("prescribed nodes", per="memory")
     path: Callable
+    nodes: Bool[Array, "*lanes"] = unchecked_quantity("prescribed nodes", per="memory")
 
-    def __init__(self, nodes: Any, path: Any):
+    def __init__(self, nodes: ArrayLike, path: Callable):
         nodes = jnp.asarray(nodes)
         if nodes.dtype != bool:
             raise ValueError(f"Pins: got nodes of dtype {nodes.dtype}, expected booleans, one for each lane.")
@@ -50,14 +49,14 @@ class Pins(eqx.Module):
         self.path = as_module(path)
 
     def prescribe(self, t: ArrayLike, state: Particles) -> Particles:
-        """The state with the led lanes where the path is at the time t [s], and as fast."""
+        """The state with the kinematic nodes on the path at the time t [s], with its velocity."""
         position, velocity = self._motion(t, state)
         position, velocity = (
             self._replace_prescribed(position, state.position),
             self._replace_prescribed(velocity, state.velocity),
         )
-        # kept apart: XLA on CPU would follow the path again for every neighbour that looks at a lane
-        return state._replace(**lax.optimization_barrier({"position": position, "velocity": velocity}))
+        # materialised: XLA on CPU would evaluate the path again for every neighbour that reads a node
+        return state._replace(**block_fusion({"position": position, "velocity": velocity}))
 
     lead = prescribe
     """The name of the first edition."""
@@ -65,12 +64,12 @@ class Pins(eqx.Module):
     def prescribe_acceleration(
         self, t: ArrayLike, state: Particles, acceleration: Float[Array, "*lanes dim"]
     ) -> Float[Array, "*lanes dim"]:
-        """The accelerations [m/s²] with that of the path, its second derivative, where lanes are led."""
+        """The accelerations [m/s²], at kinematic nodes the second derivative of the path."""
         t = self._clock(t, state)
         _, path_acceleration = jax.jvp(lambda t: self._motion(t, state)[1], (t,), (jnp.ones_like(t),))
         return self._replace_prescribed(path_acceleration, acceleration)
 
-    def prepare(self, state: Any) -> "Pins":
+    def prepare(self, state: PyTree) -> "Pins":
         """The pins as part of a scene that starts in this state, their numbers in its dtype; the checks are here."""
         demand_particles("Pins", state, "bodies are held by a mask, or by a point of theirs, mass=inertia.about(point)")
         if self.nodes.shape != state.lanes:
@@ -116,7 +115,7 @@ def _is_broadcastable(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:
 
 
 def _demand_start(pins: Pins, state: Particles) -> None:
-    """Raise a ValueError unless the path is finite at t = 0 and the led lanes start on it, but for rounding."""
+    """Raise a ValueError unless the path is finite at t = 0 and the kinematic nodes start on it, to rounding."""
     position, velocity = pins._motion(0.0, state)
     nodes, x = concrete_or_none(pins.nodes), concrete_or_none(state.position)
     position, velocity = concrete_or_none(position), concrete_or_none(velocity)
@@ -135,6 +134,6 @@ def _demand_start(pins: Pins, state: Particles) -> None:
     far = off > 16 * float(jnp.finfo(state.dtype).eps) * max(np.abs(x).max(), np.abs(position[nodes]).max(initial=0.0))
     if far.any():
         raise ValueError(
-            f"Pins: {far.sum()} of {far.size} led lanes do not start on the path: lane {where[far][0].tolist()} is at "
+            f"Pins: {far.sum()} of {far.size} nodes do not start on the path: lane {where[far][0].tolist()} is at "
             f"{x[nodes][far][0]}, path(0) is {position[nodes][far][0]} [m]. Start there: state = pins.prescribe(0.0, state)."
         )

@@ -6,18 +6,18 @@ earlier axes count scenes. A per-lane number is a scalar or has the shape of the
 unless a force says otherwise.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, wraps
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.backend import SINGLE_PIECE_NODES, materialise
+from physjax.backend import materialise, needs_split_compilation
 from physjax.loops import (
     RECORD,
     Time,
@@ -29,7 +29,9 @@ from physjax.loops import (
 )
 from physjax.particles import Particles, demand_state_record
 from physjax.parts import (
+    Contact,
     Force,
+    ParticleSource,
     adopt_force,
     as_module,
     as_tuple,
@@ -44,11 +46,11 @@ from physjax.pins import Pins
 from physjax.quantities import build_lane_mask, demand_fitting_numbers, mark_invalid_lanes, may_hide_lanes
 
 
-def project(motion: Callable, scene: "Scene", t: Time, dt: Time) -> "Scene":
-    """The lecture's response: step as if nothing were there, then put back and turn around what went in.
+def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
+    """The lecture's response: step as if nothing were there, then move back and reflect what is inside.
 
-    Cheap and robust, first order in dt: a bounce happens at the end of the step, not when the surface was met, and a
-    lane that crosses a thin obstacle within one step is not seen.
+    Cheap and robust, first order in dt: a bounce happens at the end of the step, not at the time of impact, and a
+    lane that crosses a thin obstacle within one step is missed.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.project)
@@ -66,12 +68,12 @@ def project(motion: Callable, scene: "Scene", t: Time, dt: Time) -> "Scene":
 
 
 class Scene(eqx.Module):
-    """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held or led, or born.
+    """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held, prescribed or born.
 
     `mass` is a scalar or per lane, an `Inertia` for rigid bodies. `forces` are library forces or any callable
     `(t, state, mass) -> newtons`. `pinned` is a boolean mask over the lanes that are held, or `Pins(nodes, path)`, which
-    leads them. With an `emitter` the lanes are born and die. Every number becomes an array of the state's dtype:
-    changing it compiles nothing, and it can be swept and differentiated. Raises ValueError or TypeError for shapes that
+    prescribes their motion. With an `emitter` the lanes are born and die. Every number becomes an array of the state's dtype:
+    changing it does not recompile, and it can be swept and differentiated. Raises ValueError or TypeError for shapes that
     do not match, numbers that are not finite, and masses <= 0.
 
     Example:
@@ -80,23 +82,23 @@ class Scene(eqx.Module):
         [ -3.  -13.8]
     """
 
-    state: Any = eqx.field(metadata=RECORD)
-    mass: Any = eqx.field(metadata=RECORD)
+    state: PyTree = eqx.field(metadata=RECORD)
+    mass: PyTree = eqx.field(metadata=RECORD)
     forces: tuple
     contacts: tuple
-    pinned: Bool[Array, "*lanes"] | eqx.Module | None = eqx.field(metadata=RECORD)
-    emitter: eqx.Module | None
+    pinned: Bool[Array, "*lanes"] | Pins | None = eqx.field(metadata=RECORD)
+    emitter: ParticleSource | None
     reaction: Callable | None = eqx.field(init=False)
 
     @jax.transfer_guard("allow")  # what a scene is given goes to the device on purpose
     def __init__(
         self,
-        state: Any,
-        mass: Any = 1.0,
-        forces: Any = (),
-        contacts: Any = (),
-        pinned: Any = None,
-        emitter: Any = None,
+        state: PyTree,
+        mass: PyTree = 1.0,
+        forces: Sequence[Callable] = (),
+        contacts: Sequence[Contact] = (),
+        pinned: ArrayLike | Pins | None = None,
+        emitter: ParticleSource | None = None,
     ):
         demand_state_record(state)
         state, mass = state.validate(mass)
@@ -142,7 +144,7 @@ class Scene(eqx.Module):
     @property
     def held(self) -> Bool[Array, "*lanes"] | None:
         """Mask of the lanes that no force moves, held where they are or moved along a path; None where there are none."""
-        return self.pinned if self.prescribed_motion is None else self.prescribed_motion.nodes
+        return self.pinned.nodes if isinstance(self.pinned, Pins) else self.pinned
 
     @property
     def prescribed_motion(self) -> Pins | None:
@@ -151,8 +153,8 @@ class Scene(eqx.Module):
 
     @property
     def compiles_in_pieces(self) -> bool:
-        """Whether a step is compiled in pieces: where more than a few nodes look at each other."""
-        return self.couples and self.state.lanes[-1:] > (SINGLE_PIECE_NODES,)
+        """Whether a step is compiled in pieces, as it is where more than a few nodes are coupled."""
+        return needs_split_compilation(self.couples, self.state.lanes)
 
     def may_be_cut(self) -> bool:
         """Whether some lanes can be stepped without the rest: independent ones, and no part may hide an array of all lanes.
@@ -162,7 +164,7 @@ class Scene(eqx.Module):
         whole = self.couples or self.prescribed_motion is not None or bool(find_plain_functions(self.forces))
         return not whole and not may_hide_lanes(self, self.state.lanes, self.state.position.shape[-1])
 
-    def build_lane_mask(self, tree: Any) -> Any:
+    def build_lane_mask(self, tree: PyTree) -> PyTree:
         """The tree with True in place of each array that has an entry for each lane of this scene, False elsewhere."""
         return build_lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
 
@@ -201,26 +203,26 @@ class Scene(eqx.Module):
         """Newton's second law for particles, a = ΣF/m [m/s²]; held lanes do not accelerate, kinematic ones as their path does."""
         return state.generalised_force(self, t)
 
-    def rate(self, t: Time, state: Any) -> Any:
+    def rate(self, t: Time, state: PyTree) -> PyTree:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.compiles_in_pieces:
             return state.rate(state.generalised_force(self, t), self.mass)
-        # apart, or a method's stage would be computed anew in every neighbour that looks at it
+        # materialised, or XLA would recompute a stage in every neighbour that reads it
         return state.rate(materialise(to_float_time(t), lambda: state.generalised_force(self, t)), self.mass)
 
-    def kick(self, state: Any, rate: Any, dt: ArrayLike) -> Any:
+    def kick(self, state: PyTree, rate: PyTree, dt: ArrayLike) -> PyTree:
         """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""
         return state.kick(rate, dt)
 
-    def drift(self, state: Any, dt: ArrayLike) -> Any:
+    def drift(self, state: PyTree, dt: ArrayLike) -> PyTree:
         """Positions (of bodies also orientations) moved by the velocities in `state` for a time dt."""
         return state.drift(dt, self.mass)
 
-    def normalised(self, state: Any) -> Any:
+    def normalised(self, state: PyTree) -> PyTree:
         """The state as it must be after a step, where its arrays have to agree with each other."""
         return state.normalised(self.mass)
 
-    def _view(self, force: Force) -> tuple[Any, Any]:
+    def _view(self, force: Force) -> tuple[PyTree, PyTree]:
         """The state and the mass that a force sees."""
         return self.state.view_for_force(force, self.mass)
 
@@ -234,7 +236,7 @@ class Scene(eqx.Module):
         """Whether every force resists motion with a symmetric Jacobian: an implicit step may then use conjugate gradients."""
         return not self.state.rotates and all(force.dissipative_symmetric for force in self.forces)
 
-    def linearised_at(self, t: Time, state: Any) -> "Scene":
+    def linearised_at(self, t: Time, state: PyTree) -> "Scene":
         """The scene that an implicit step differentiates at this state in place of this one."""
         state = state if self.prescribed_motion is None else self.prescribed_motion.prescribe(to_float_time(t), state)
         see = lambda f: state.view_for_force(f, self.mass)  # noqa: E731
@@ -294,7 +296,7 @@ class Scene(eqx.Module):
                 scene = _advance_force(i, scene, t, dt)
         return scene
 
-    def replace(self, **parts: Any) -> "Scene":
+    def replace(self, **parts: PyTree) -> "Scene":
         """The scene with some of its parts replaced, unchecked."""
         names = list(parts)
         where = lambda scene: [getattr(scene, name) for name in names]  # noqa: E731
@@ -303,7 +305,7 @@ class Scene(eqx.Module):
     having = replace
     """The name of the first edition."""
 
-    def finite(self, state: Any) -> Bool[Array, "..."]:
+    def finite(self, state: PyTree) -> Bool[Array, "..."]:
         """Whether the state is finite, per lane, or per scene where lanes are coupled."""
         status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
         good = jnp.all(jnp.stack(status), axis=0)
@@ -323,11 +325,11 @@ def _resolve_contact(index: int, scene: Scene, t: Time) -> Scene:
     return scene.replace(state=state)
 
 
-def _prescribe(scene: Scene, start: Any, t: Time) -> Scene:
+def _prescribe(scene: Scene, start: PyTree, t: Time) -> Scene:
     """Kinematic nodes where their path is at the time t, held ones where they were at the start of the step."""
     if scene.prescribed_motion is not None:
         return scene.replace(state=scene.prescribed_motion.prescribe(to_float_time(t), scene.state))
-    held = scene.pinned[..., None]
+    held = jnp.asarray(scene.held)[..., None]
     return scene.replace(state=jax.tree.map(lambda now, before: jnp.where(held, before, now), scene.state, start))
 
 
@@ -341,7 +343,7 @@ def _advance_force(index: int, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Sce
 
 
 def trace_once(response: Callable) -> Callable:
-    """A response traced once for all who step the same scene: a search with derivatives steps it in many places."""
+    """A response traced once for all callers that step the same scene: a search with derivatives does so in many places."""
     program = jax.jit(response)
 
     @wraps(response)
@@ -359,14 +361,18 @@ class SubdividingMethod(Protocol):
         """The scene as it is stepped; refuses what cannot be subdivided."""
         ...
 
+    def __call__(self, system: Scene, t: Time, state: PyTree, dt: ArrayLike) -> PyTree:
+        """The state after dt."""
+        ...
 
-def free_motion(method: Callable, scene: Scene, t: Time, dt: Time) -> Scene:
+
+def free_motion(method: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
     seen = method.check_scene(scene) if isinstance(method, SubdividingMethod) else scene.averaged_over_step(t, dt)
     return scene.replace(state=scene.normalised(method(seen, time_for_method(method, t), scene.state, dt)))
 
 
-def loads(scene: Scene, t: Time, state: Any = None, *, per_term: bool = False) -> Any:
+def loads(scene: Scene, t: Time, state: PyTree = None, *, per_term: bool = False) -> PyTree:
     """Total force on each lane [N] (the lecture's ComputeTotalForce), at `scene.state` unless a state is given.
 
     Returns an array shaped like the velocity, for rigid bodies a `Wrench` of force [N] and torque about the centre of

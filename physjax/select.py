@@ -1,4 +1,4 @@
-"""A scene with other lanes: every array that has an entry for each is cut to those that stay."""
+"""A scene with some of its lanes: every array that has an entry for each lane is cut to those selected."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,7 +10,7 @@ from physjax.scene import Scene
 def select_lane(scene: Scene, lane: int | tuple[int, ...]) -> Scene:
     """A single lane of a scene of independent ones, or a single scene of many coupled ones, by its index.
 
-    What a plain function holds nobody can see, so it stays as it is. Raises IndexError where there is no such lane.
+    What a plain function closes over cannot be cut. Raises IndexError where there is no such lane.
     """
     index = lane if isinstance(lane, tuple) else (lane,)
     shape = scene.status_shape

@@ -1,12 +1,11 @@
 """Results as text: aligned tables, times with a readable unit, progress, and the machine that numbers were measured on."""
 
-import platform
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-import jax
+from physjax.backend import describe_device
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str | None = None) -> str:
@@ -40,7 +39,5 @@ def format_seconds(seconds: int | float) -> str:
 
 def describe_machine() -> str:
     """One line about where numbers were measured: device, processor, versions."""
-    device = jax.devices()[0]
     versions = ", ".join(f"{name} {version(name)}" for name in ("jax", "diffrax", "numpy"))
-    chip = platform.machine() if device.platform == "cpu" else device.device_kind
-    return f"{device.platform.upper()} ({chip}), {platform.system()}, Python {platform.python_version()}, {versions}"
+    return f"{describe_device()}, Python {sys.version.split()[0]}, {versions}"

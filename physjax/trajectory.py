@@ -1,22 +1,23 @@
 """What a run returns: frames over time, a status per lane, and enough memory of the run to step again inside it."""
 
 import os
+from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import concrete_or_none
 from physjax.crossing import Crossing, find_first_crossing
 from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
 from physjax.loops import moment_at
-from physjax.particles import Particles
-from physjax.parts import Contact, Function, as_module, build_memory_mask, callable_name, has_memory
+from physjax.particles import Particles, callable_name
+from physjax.parts import Contact, Function, as_module, build_memory_mask, has_memory
 from physjax.scene import Scene
 
 
@@ -25,7 +26,7 @@ class Trajectory(eqx.Module):
 
     `.ok` says whether the state stayed finite, per lane (per scene where lanes are coupled); `.first_bad_step` where it
     did not. `.parts` are the forces, contacts and emitter that remember, with the arrays they changed at every frame.
-    `.recorded` replaces `.state` when `simulate` was told what to `record`. `.final_scene` is the scene at the end of
+    `.recorded` replaces `.state` when `simulate` was given a `record`. `.final_scene` is the scene at the end of
     the run, from which it can be resumed.
 
     Example:
@@ -34,13 +35,13 @@ class Trajectory(eqx.Module):
     """
 
     time: Float[Array | np.ndarray, "frames *lanes"]
-    state: Any
+    state: PyTree
     parts: tuple
-    recorded: Any
+    recorded: PyTree
     ok: Bool[Array | np.ndarray, "..."]
     scene: Scene | None
     final_scene: Scene | None
-    stepper: Any
+    stepper: Callable | None
     dt: Float[Array | np.ndarray, "..."] | None
     first_step: Int[Array | np.ndarray, ""]
     save_every: int = eqx.field(static=True)
@@ -70,7 +71,7 @@ class Trajectory(eqx.Module):
         return states.view_for_force(None, self._demand_scene("velocity").mass)[0].velocity
 
     @property
-    def method(self) -> Any:
+    def method(self) -> Callable | None:
         """The method that made the run; None when it came from a reference solver.
 
         Example:
@@ -133,7 +134,7 @@ class Trajectory(eqx.Module):
         held = "ok" if ok.all() else f"{ok.size - ok.sum()} of {ok.size} blew up"
         return f"<Trajectory: {how}{len(time)} frames from t = {time.min():g} to {time.max():g} s, {shape}, {held}>"
 
-    def crossing(self, surface: Any, *, direction: int | None = None) -> Crossing:
+    def crossing(self, surface: Callable | ArrayLike, *, direction: int | None = None) -> Crossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 
         `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
@@ -176,11 +177,13 @@ class Trajectory(eqx.Module):
             for keys, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 arrays[group + jax.tree_util.keystr(keys)] = leaf
         with write_atomically(path, "wb") as file:
-            np.savez_compressed(file, **{name: np.asarray(array) for name, array in arrays.items()})
+            np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()})
 
     @classmethod
     @jax.transfer_guard("allow")
-    def load(cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Any = None) -> "Trajectory":
+    def load(
+        cls, path: str | os.PathLike, *, scene: Scene | None = None, method: Callable | None = None
+    ) -> "Trajectory":
         """Read a saved run. Give the scene and the method it was made with to step again inside it or to resume it.
 
         Without them frames and status are there all the same, of particles; bodies want their scene. What was recorded
@@ -199,7 +202,7 @@ class Trajectory(eqx.Module):
         demand_saved_run(path, arrays)
         return _restore_run(cls, arrays, scene, method)
 
-    def _collect_saved_trees(self) -> dict[str, Any]:
+    def _collect_saved_trees(self) -> dict[str, PyTree]:
         """The pytrees that go into a file, by the name they have there."""
         groups = {"state": self.state, "parts": self.parts, "recorded": self.recorded}
         if self.final_scene is not None:
@@ -214,10 +217,10 @@ class Trajectory(eqx.Module):
             )
         return self.scene
 
-    def _demand_states(self) -> Any:
+    def _demand_states(self) -> PyTree:
         if self.state is None:
             raise AttributeError(
-                "this trajectory holds .recorded only: simulate was told what to record instead of the state."
+                "this trajectory holds .recorded only: simulate was given record=, which replaces the state."
             )
         return self.state
 
@@ -239,20 +242,21 @@ def _find_first_bad_step(scene, method, dt, first_step, steps):
 
 
 def select_stateful_parts(scene: Scene) -> tuple:
-    """The parts of the scene with memory: forces that advance, contacts that know who touches them, an emitter."""
+    """The parts of the scene with memory: forces that advance, contacts that remember since when lanes touch them, an emitter."""
     return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if has_memory(part))
 
 
-def _replace_memories(scene: Scene, state: Any, parts: tuple) -> Scene:
+def _replace_memories(scene: Scene, state: PyTree, parts: tuple) -> Scene:
     """The scene with another state, and with other memories in those of its parts that have some."""
-    parts = iter(parts)
-    renewed = lambda old: tuple(next(parts) if has_memory(part) else part for part in old)  # noqa: E731
+    remaining = iter(parts)
+    renewed = lambda old: tuple(next(remaining) if has_memory(part) else part for part in old)  # noqa: E731
     forces, contacts, (emitter,) = renewed(scene.forces), renewed(scene.contacts), renewed((scene.emitter,))
     return scene.replace(state=state, forces=forces, contacts=contacts, emitter=emitter)
 
 
-def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, method: Any) -> Trajectory:
+def _restore_run(cls: type, saved: dict[str, np.ndarray], scene: Scene | None, method: Callable | None) -> Trajectory:
     """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
+    arrays: dict[str, Array | np.ndarray] = dict(saved)
     ours, made_by = "dt" in arrays, str(arrays.pop("method"))
     if ours and method is not None and made_by not in (callable_name(method), "NoneType"):
         raise ValueError(
@@ -260,33 +264,21 @@ def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, 
             "with; to go on with another one, simulate(run.final_scene, ...)."
         )
     if scene is not None and ours:
-        scene = _cast_to_run(scene, arrays)
+        scene = _cast_to_run(scene, saved)
     # a run of float64 without 64-bit types stays in NumPy, where nothing is rounded
     exact = lambda array: ours and jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype  # noqa: E731
     floats = [array for array in arrays.values() if array.dtype.kind == "f"]
     if all(map(exact, floats)):
         arrays = {name: jnp.asarray(array) if ours else array for name, array in arrays.items()}
     recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
-    state = parts = final_scene = None
-    if scene is not None and ours:
-        final_state = _fill_tree("final_state", scene.state, arrays)
-        if final_state.position.shape != scene.state.position.shape:
-            raise ValueError(
-                f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
-                "Give the scene the run was made with."
-            )
-        final_parts = _fill_tree("final_parts", select_stateful_parts(scene), arrays, shaped=True)
-        _demand_same_contacts(select_stateful_parts(scene), final_parts)
-        final_scene = _replace_memories(scene, final_state, final_parts)
-        if not recorded:
-            parts = _fill_tree("parts", select_stateful_parts(scene), arrays, shaped=True)
-            _demand_same_contacts(select_stateful_parts(scene), parts)
+    final_scene, parts = (None, ()) if scene is None or not ours else _restore_end(scene, arrays, not recorded)
+    state = None
     if not recorded:
-        state = _fill_tree("state", Particles(0, 0) if scene is None else scene.state, arrays)
+        state = _fill_tree("state", Particles(jnp.zeros(0), jnp.zeros(0)) if scene is None else scene.state, arrays)
     return cls(
         time=arrays["time"],
         state=state,
-        parts=parts or (),
+        parts=parts,
         recorded=recorded.get("", recorded) if recorded else None,
         ok=arrays["ok"],
         scene=scene,
@@ -297,6 +289,24 @@ def _restore_run(cls: type, arrays: dict[str, np.ndarray], scene: Scene | None, 
         save_every=int(arrays["save_every"]),
         steps=int(arrays["steps"]),
     )
+
+
+def _restore_end(scene: Scene, arrays: dict[str, Array | np.ndarray], filmed: bool) -> tuple[Scene, tuple]:
+    """The scene at the end of the run, and the parts with memory over its frames, where these were `filmed`."""
+    final_state = _fill_tree("final_state", scene.state, arrays)
+    if final_state.position.shape != scene.state.position.shape:
+        raise ValueError(
+            f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
+            "Give the scene the run was made with."
+        )
+    stateful = select_stateful_parts(scene)
+    final_parts = _fill_tree("final_parts", stateful, arrays, shaped=True)
+    _demand_same_contacts(stateful, final_parts)
+    parts = ()
+    if filmed:
+        parts = _fill_tree("parts", stateful, arrays, shaped=True)
+        _demand_same_contacts(stateful, parts)
+    return _replace_memories(scene, final_state, final_parts), parts
 
 
 def _cast_to_run(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:
@@ -330,7 +340,7 @@ def _demand_same_contacts(given: tuple, found: tuple) -> None:
             )
 
 
-def _fill_tree(group: str, like: Any, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> Any:
+def _fill_tree(group: str, like: PyTree, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> PyTree:
     """The pytree `like` with its leaves replaced by that group of arrays, `shaped` as they are, of parts also with frames."""
     leaves, tree = jax.tree_util.tree_flatten_with_path(like)
     names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]

@@ -6,11 +6,15 @@ times slower on CPU). Derivatives are safe where the formulas are not: the norm 
 any order and in any nesting of forward and reverse mode.
 """
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 
 def dot(a: Float[Array, "*lanes dim"], b: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
@@ -110,6 +114,19 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
     if number.ndim == 0:
         return number * array
     return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
+
+
+def add_trailing_axes(number: AnyArray, ndim: int) -> AnyArray:
+    """A number per scene with axes of length 1 behind its own, `ndim` in all, so that it meets numbers per lane.
+
+    A scalar stays one: it meets everything as it is, and the compiled program has one operation fewer.
+    """
+    return number.reshape(number.shape + (1,) * (ndim - number.ndim)) if number.ndim else number
+
+
+def add_leading_axes(number: AnyArray, ndim: int) -> AnyArray:
+    """A number per spring or per node with axes of length 1 before its own, `ndim` in all; a scalar stays one."""
+    return number.reshape((1,) * (ndim - number.ndim) + number.shape) if number.ndim else number
 
 
 def broadcast_vector(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:

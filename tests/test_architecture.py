@@ -23,8 +23,9 @@ FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 
 FLOORS = (
-    {"vectors", "checks", "files", "text", "backend", "loops", "closures", "mesh_files", "old_names"},
-    {"roots", "meshes", "projectile"},
+    {"backend"},
+    {"vectors", "checks", "files", "text", "loops", "linear", "closures", "mesh_files", "old_names"},
+    {"roots", "cubics", "meshes", "projectile"},
     {"particles", "quantities"},
     {"parts"},
     {"pins"},
@@ -162,6 +163,16 @@ def test_every_exported_name_exists_and_is_documented():
     )
 
 
+@pytest.mark.parametrize("name", physjax.__all__)
+def test_tab_shows_what_is_ours_and_nothing_else(name):
+    face = getattr(physjax, name)
+    if inspect.ismodule(face):
+        assert sorted(dir(face)) == sorted(face.__all__)
+        assert not [item for item in dir(face) if item.startswith("_")]
+        foreign = [item for item in dir(face) if inspect.ismodule(getattr(face, item))]
+        assert all(getattr(face, item).__name__.startswith("physjax.") for item in foreign)
+
+
 @pytest.mark.parametrize("file", [file for file in FILES if room(file) in {"physics", "stepping", "vectors"}])
 def test_vectors_are_written_by_components_and_never_scattered(file):
     slow = {"einsum", "tensordot", "matmul", "vdot", "linalg"}
@@ -170,6 +181,22 @@ def test_vectors_are_written_by_components_and_never_scattered(file):
         assert not (isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult)), f"{file}:{node.lineno} @"
         scatter = isinstance(node, ast.Subscript) and getattr(node.value, "attr", "") == "at"
         assert not scatter, f"{file}:{node.lineno} .at["
+
+
+COMPILER_WORDS = (
+    "default_backend",
+    "optimization_barrier",
+    "compiler_options",
+    "process_time",
+    "__version_info__",
+    "platform",
+)
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if file != "backend.py"])
+def test_one_file_knows_the_compiler_and_the_device(file):
+    text = FILES[file].read_text(encoding="utf-8")
+    assert [word for word in COMPILER_WORDS if word in text] == [], f"{file}: ask physjax.backend"
 
 
 # a scene pays only for what it uses

@@ -140,7 +140,7 @@ def test_a_mask_is_held_and_pins_say_who_is(unannotated):
             START,
             lambda t: jnp.array([t, t + 1.0]),
             ValueError,
-            r"1 of 1 led lanes .* lane \[0\] is at .* pins\.prescribe\(",
+            r"1 of 1 nodes .* lane \[0\] is at .* pins\.prescribe\(",
         ),
     ],
 )

@@ -23,9 +23,10 @@ from physjax import (
     springs,
     stability,
 )
+from physjax.backend import MIN_LANES_TO_CUT, MIN_STEPS_PER_FRAME
 from physjax.physics.forces import flows
 from physjax.physics.rigid import inertia
-from physjax.stepping.blocks import MIN_LANES_TO_CUT, MIN_STEPS_PER_FRAME, Blocks
+from physjax.stepping.blocks import Blocks
 
 BALL = Particles(jnp.array([0.0, 1.0]), jnp.array([3.0, 4.0]))
 TWO = np.array([0.1, 0.2])

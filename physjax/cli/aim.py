@@ -1,16 +1,20 @@
 """`physjax aim`: which launch hits a target."""
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from physjax.scene import Scene
+    from physjax.study.inverse.aim import Aimed
 
 
-def add_command(commands: Any) -> None:
-    """Enter the command and its options among those of `physjax`."""
+def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command and its options to those of `physjax`."""
     command = commands.add_parser("aim", help="which angle hits a target: both arcs, with drag and wind")
     command.add_argument("--target", type=float, nargs="+", required=True, metavar="M", help="x y, or x y z [m]")
     command.add_argument("--speed", type=float, help="launch speed [m/s]; the least that hits if left out")
     command.add_argument(
-        "--start", type=float, nargs="+", metavar="M", help="where it is fired from [m] (default: the origin)"
+        "--start", type=float, nargs="+", metavar="M", help="where it is launched from [m] (default: the origin)"
     )
     command.add_argument(
         "--drag", type=float, metavar="CDA", help="drag coefficient times area [m²], in air of 1.225 kg/m³"
@@ -29,30 +33,15 @@ def _run_aim(options: argparse.Namespace) -> None:
     """Print both arcs to a target with their angle, flight time and apex; write their picture as PNG."""
     import jax
     import matplotlib
-    import numpy as np
 
     from physjax.files import ensure_writable_folder, write_atomically
     from physjax.study.inverse.aim import aim_at
-    from physjax.text import format_table
 
     with jax.enable_x64(True):
         scene = _build_throw(options)
         folder = ensure_writable_folder(options.out)
         aimed = aim_at(scene, options.target, speed=options.speed)
-        arcs = {"low": aimed.low, "high": aimed.high} if options.speed is not None else {"least speed": aimed.low}
-        angles = ["angle [°]"] if aimed.low.azimuth is None else ["angle [°]", "azimuth [°]"]
-        rows = [
-            [
-                name,
-                "hit" if shot.ok else "out of reach",
-                *(f"{np.degrees(angle):.4f}" for angle in (shot.angle, shot.azimuth) if angle is not None),
-                *(f"{float(number):.4f}" for number in (shot.speed, shot.time, shot.apex)),
-                f"{float(shot.miss):.2g}",
-            ]
-            for name, shot in arcs.items()
-        ]
-        headers = ["arc", "", *angles, "speed [m/s]", "time [s]", "apex [m]", "miss [m]"]
-        print(format_table(headers, rows, align="<<" + ">" * (len(headers) - 2)))
+        print(_format_arcs(aimed, any_speed=options.speed is None))
         if not aimed.ok:
             print("The target is out of reach: these are the nearest misses.")
         matplotlib.use("Agg")
@@ -61,14 +50,39 @@ def _run_aim(options: argparse.Namespace) -> None:
     print(f"Picture: {folder / 'aim.png'}")
 
 
-def _build_throw(options: argparse.Namespace):
-    """The scene of `physjax aim`."""
+def _format_arcs(aimed: "Aimed", any_speed: bool) -> str:
+    """A table with a line for each arc; where any speed will do, only that of the least speed."""
+    import numpy as np
+
+    from physjax.text import format_table
+
+    arcs = {"least speed": aimed.low} if any_speed else {"low": aimed.low, "high": aimed.high}
+    angles = ["angle [°]"] if aimed.low.azimuth is None else ["angle [°]", "azimuth [°]"]
+    rows = [
+        [
+            name,
+            "hit" if shot.ok else "out of reach",
+            *(f"{np.degrees(angle):.4f}" for angle in (shot.angle, shot.azimuth) if angle is not None),
+            *(f"{float(number):.4f}" for number in (shot.speed, shot.time, shot.apex)),
+            f"{float(shot.miss):.2g}",
+        ]
+        for name, shot in arcs.items()
+    ]
+    headers = ["arc", "", *angles, "speed [m/s]", "time [s]", "apex [m]", "miss [m]"]
+    return format_table(headers, rows, align="<<" + ">" * (len(headers) - 2))
+
+
+def _build_throw(options: argparse.Namespace) -> "Scene":
+    """A point mass at rest at the start, under gravity and, if asked for, drag."""
+    import jax.numpy as jnp
+
     from physjax.particles import Particles
+    from physjax.parts import Force
     from physjax.physics import forces
     from physjax.scene import Scene
 
     dim = len(options.target)
-    start = options.start or [0.0] * dim
+    start = jnp.array(options.start or [0.0] * dim)
     for name, given in (("start", start), ("wind", options.wind)):
         if given is not None and len(given) != dim:
             raise ValueError(f"--{name}: got {len(given)} numbers, expected {dim}, as many as --target has.")
@@ -76,7 +90,7 @@ def _build_throw(options: argparse.Namespace):
         raise ValueError("--wind: got a wind without --drag, expected both: the air acts through the drag.")
     if options.up == "z" and dim == 2:
         raise ValueError("--up: got z with a target in the plane, expected x or y, or a third number for --target.")
-    loads = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
+    loads: list[Force] = [forces.Gravity(options.gravity, up="xyz".index(options.up))]
     if options.drag is not None:
         loads.append(forces.QuadraticDrag(area=options.drag, coefficient=1.0, wind=options.wind))
-    return Scene(Particles(start, [0.0] * dim), mass=options.mass, forces=tuple(loads))
+    return Scene(Particles(start, jnp.zeros(dim)), mass=options.mass, forces=tuple(loads))

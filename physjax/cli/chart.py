@@ -1,17 +1,22 @@
 """`physjax chart`: speed against accuracy for scenes of the gallery, as pictures, CSV and one page."""
 
+import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
+if TYPE_CHECKING:
+    from physjax.study.accuracy.result import WorkPrecision
+    from physjax.study.report_page import Section
+
 BOUNCING_SCENE = "bouncing_ball"
-"""The scene that shows what a contact does to the order of a method."""
+"""The scene that shows how contacts lower the order of a method."""
 
 
-def add_command(commands: Any) -> None:
-    """Enter the command and its options among those of `physjax`."""
+def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command and its options to those of `physjax`."""
     command = commands.add_parser("chart", help="chart speed against accuracy for the scenes of the gallery")
     command.add_argument(
         "scenes",
@@ -24,13 +29,15 @@ def add_command(commands: Any) -> None:
     )
     command.add_argument("--quick", action="store_true", help="coarser and faster")
     command.add_argument(
-        "--report", action="store_true", help="a page for each scene instead: all there is to say of it, charts coarse"
+        "--report",
+        action="store_true",
+        help="a page for each scene instead: accuracy, stability and energy, with coarse charts",
     )
     command.set_defaults(run=lambda options: _run_chart(options.scenes, options.out, options.quick, options.report))
 
 
 def _run_chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
-    """Study the scenes one by one; write PNG, CSV and one HTML page, print one table; or a page on the whole of each."""
+    """Study scenes one by one: PNG, CSV, one HTML page and a printed table; with `whole` a report on each scene instead."""
     import matplotlib
 
     from physjax.checks import demand_known
@@ -54,7 +61,7 @@ def _run_chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
 
 
 def _select_smooth_scenes() -> list[str]:
-    """What is charted unless told otherwise: motions without contacts or memory, and `BOUNCING_SCENE` for what a contact does.
+    """What is charted by default: scenes without contacts or memory, and `BOUNCING_SCENE`.
 
     The others are charted when they are named; all of them together would take an hour.
     """
@@ -64,7 +71,7 @@ def _select_smooth_scenes() -> list[str]:
 
 
 def _write_reports(names: list[str], folder: Path) -> None:
-    """Write a page on each scene, with its parts as progress."""
+    """Write a page on each scene, with its sections as progress."""
     import jax
 
     from physjax.files import write_atomically
@@ -85,8 +92,8 @@ def _write_reports(names: list[str], folder: Path) -> None:
         print(f"Report: {folder / f'{name}.html'}", flush=True)
 
 
-def _study_scene(name: str, folder: Path, quick: bool):
-    """One scene: its work-precision study, with PNG and CSV written; the result and its section of the page."""
+def _study_scene(name: str, folder: Path, quick: bool) -> "tuple[WorkPrecision, Section]":
+    """The work-precision study of a scene and its section of the page; PNG and CSV are written."""
     import jax
 
     from physjax.files import write_atomically
@@ -114,8 +121,8 @@ def _study_scene(name: str, folder: Path, quick: bool):
     return result, Section(name, title(name), picture, Table(result.table()))
 
 
-def _summarise(results: list) -> str:
-    """A line for each scene: the fastest method, its step and time, for each of the errors."""
+def _summarise(results: "list[WorkPrecision]") -> str:
+    """A table with a line for each scene: the fastest method, its step and its time, for each error."""
     from physjax.study.accuracy.result import TABLE_ERRORS
     from physjax.text import format_table
 
@@ -124,7 +131,7 @@ def _summarise(results: list) -> str:
     return format_table(headers, rows, align="<" * len(headers))
 
 
-def _format_fastest(result, error: float) -> str:
+def _format_fastest(result: "WorkPrecision", error: float) -> str:
     from physjax.text import format_seconds
 
     run = result.fastest(error)

@@ -1,13 +1,13 @@
 """`physjax scenes`: the gallery, listed or drawn."""
 
+import argparse
 import sys
-from typing import Any
 
 from tqdm import tqdm
 
 
-def add_command(commands: Any) -> None:
-    """Enter the command and its options among those of `physjax`."""
+def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command and its options to those of `physjax`."""
     command = commands.add_parser("scenes", help="list the scenes of the gallery, or draw them")
     command.add_argument("--only", nargs="+", default=[], metavar="SCENE", help="these scenes; all by default")
     command.add_argument(
@@ -17,7 +17,7 @@ def add_command(commands: Any) -> None:
 
 
 def _run_scenes(names: list[str], out: str | None) -> int:
-    """Print every scene, and every run that must fail; or draw the scenes. Returns 1 if one of them could not be drawn."""
+    """Print every scene, and every run that must fail; or draw the scenes. Returns 1 if one could not be drawn."""
     from physjax.checks import demand_known
     from physjax.scenes import FAILURES, SCENES, title
     from physjax.scenes.catalogue import describe_scene
@@ -34,7 +34,7 @@ def _run_scenes(names: list[str], out: str | None) -> int:
 
 
 def _render_scenes(names: list[str], out: str) -> int:
-    """Draw scenes with progress, and tell at the end which could not be drawn, and why."""
+    """Draw scenes with progress, and report at the end which could not be drawn, and why."""
     import matplotlib
 
     from physjax.files import ensure_writable_folder

@@ -1,11 +1,14 @@
 """`physjax sweep`: an outcome of a scene over a grid of the numbers that it is built from."""
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
-def add_command(commands: Any) -> None:
-    """Enter the command and its options among those of `physjax`."""
+def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command and its options to those of `physjax`."""
     command = commands.add_parser(
         "sweep", help="an outcome of a scene over a grid of the numbers that it is built from"
     )
@@ -27,9 +30,10 @@ def add_command(commands: Any) -> None:
 
 
 def _run_sweep(options: argparse.Namespace) -> None:
-    """Print the best points and what failed; write the results, resumably, and their picture."""
+    """Print the best points and the failures; write the results, so that a sweep can be resumed, and their picture."""
     import jax
     import matplotlib
+    from matplotlib.figure import Figure
 
     from physjax.checks import demand_known
     from physjax.files import ensure_writable_folder, write_atomically
@@ -37,17 +41,15 @@ def _run_sweep(options: argparse.Namespace) -> None:
     from physjax.stepping.methods import METHODS
     from physjax.study.sweeps.observables import OBSERVABLES, sweep_scene
 
-    build, outcome = (
-        SCENES[demand_known("scene", options.scene, SCENES)],
-        demand_known("outcome", options.outcome, OBSERVABLES),
-    )
+    build = SCENES[demand_known("scene", options.scene, SCENES)]
+    outcome = demand_known("outcome", options.outcome, OBSERVABLES)
     method = METHODS[demand_known("method", options.method, METHODS)]
     axes = dict(_parse_range(text) for text in options.over)
     folder = ensure_writable_folder(options.out)
     matplotlib.use("Agg")
     with jax.enable_x64(True):
         found = sweep_scene(build, axes, outcome, method=method, steps=options.steps, out=folder / "chunks")
-        words = OBSERVABLES[outcome].__doc__.strip().rstrip(".")
+        words = (OBSERVABLES[outcome].__doc__ or "").strip().rstrip(".")
         if found.ok.any():
             for name, largest in (("least", False), ("most", True)):
                 best = found.best(outcome, largest=largest)
@@ -58,11 +60,11 @@ def _run_sweep(options: argparse.Namespace) -> None:
         found.save(folder / "sweep.npz")
         drawn = found.plot(outcome, labels={outcome: words})
         with write_atomically(folder / "sweep.png", "wb") as file:
-            (drawn if hasattr(drawn, "savefig") else drawn.figure).savefig(file, dpi=125)
+            (drawn if isinstance(drawn, Figure) else drawn.figure).savefig(file, dpi=125)
     print(f"{words}: {folder / 'sweep.npz'}, {folder / 'sweep.png'}")
 
 
-def _parse_range(text: str) -> tuple[str, Any]:
+def _parse_range(text: str) -> "tuple[str, np.ndarray]":
     """An axis from NAME=LOW:HIGH:COUNT."""
     import numpy as np
 

@@ -1,1 +1,1 @@
-"""What acts on a scene: forces now; each is usable under every method."""
+"""What acts on a scene: forces, springs, contacts, rigid bodies and emitters, each usable under every method."""

@@ -1,4 +1,7 @@
-"""The gallery: each scene is one decorated function that carries its own truth. A new file in this folder is found by itself."""
+"""The gallery of scenes: each is one decorated function with its own truths; every file in this folder is imported.
+
+To add a scene, write a function that returns a `Problem` under `@scene`, in a file of this folder, old or new.
+"""
 
 from importlib import import_module
 from pkgutil import iter_modules

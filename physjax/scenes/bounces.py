@@ -1,6 +1,6 @@
-"""Things that bounce, slide and come to rest: every touch is found inside the step.
+"""Balls that bounce and sleds that slide and stop: contacts are resolved at their time of impact within the step.
 
-A contact acts on the centre of a ball, so each surface stands a radius before the floor or wall that is seen.
+Contacts act on the centre of a ball, so each surface is a radius in front of the floor or wall that is drawn.
 """
 
 from typing import NamedTuple
@@ -18,10 +18,10 @@ from physjax.study.problem import Problem, Truth
 
 @scene
 def bouncing_ball(restitution: float = 0.8, wind: float = 10.0, g: float = 9.8) -> Problem:
-    """Forty-eight basketballs dropped from 1 to 2 m in a downdraught of 10 m/s, which bounce three or four times.
+    """Forty-eight basketballs dropped from 1 to 2 m in a downdraught of 10 m/s, each bouncing three or four times.
 
-    In air at rest the drag -|v|v has a corner where a ball turns round, and no method would be better than order 3; in
-    the downdraught the air always comes from above, so that what lowers an order here is the treatment of the bounce.
+    In still air the drag -|v|v is not smooth where a ball turns round, which limits every method to order 3. In the
+    downdraught the relative velocity never changes sign, so that only the treatment of the bounce can lower an order.
     """
     mass, radius, coefficient, density = 0.624, 0.12, 0.5, 1.225
     area = np.pi * radius**2
@@ -33,42 +33,34 @@ def bouncing_ball(restitution: float = 0.8, wind: float = 10.0, g: float = 9.8) 
         contacts=(contacts.Plane((radius,), (1.0,), restitution=restitution),),
     )
     air = _Downdraught(g, wind, np.sqrt(2 * mass * g / (density * coefficient * area)))
+    impact = -air.after(air.landing(drop, 0.0), 0.0)[1]
 
     def exact(t):
         height, velocity = _trace_bounces(t, air, drop, restitution)
         return Particles(radius + height[..., None], velocity[..., None])
 
-    def rebound(flight):
+    def apex(flight):
         """The apex after the first bounce, from the first frame on the way up."""
         rising = np.argmax(flight.velocity[..., 0] > 0, axis=0)
         height, velocity = (leaf[rising, np.arange(drop.size), 0] for leaf in flight.state)
         return height - radius + air.climb(velocity)
 
-    impact = -air.after(air.landing(drop, 0.0), 0.0)[1]
+    excess = lambda flight: np.maximum(apex(flight) - restitution**2 * drop, 0.0)  # noqa: E731
+    rises = air.climb(restitution * impact)
     return Problem(
         balls,
         duration=2.0,
         exact=exact,
         truths=(
-            Truth(
-                "rebounds as high as K_r times the speed of its fall takes it [m]",
-                rebound,
-                air.climb(restitution * impact),
-                1e-9,
-            ),
-            Truth(
-                "rebounds less than K_r² h, what it would in a vacuum [m]",
-                lambda flight: np.maximum(rebound(flight) - restitution**2 * drop, 0.0),
-                0.0,
-                0.0,
-            ),
+            Truth("rebounds to the height reached from K_r times the impact speed [m]", apex, rises, 1e-9),
+            Truth("rebounds to less than K_r² h, its height in a vacuum [m]", excess, 0.0, 0.0),
         ),
     )
 
 
 @scene
 def tennis_ball(g: float = 9.8) -> Problem:
-    """Tennis balls by the rules: dropped from 254 cm they must rebound to 135 to 147 cm, so 0.7291 <= K_r <= 0.7607."""
+    """Tennis balls by the rules: dropped from 254 cm they rebound to 135 to 147 cm, which is 0.7291 <= K_r <= 0.7607."""
     mass, radius, drop = 0.0577, 0.0335, 2.54
     restitution = np.linspace(0.7291, 0.7607, 5)
     start = jnp.full((restitution.size, 1), radius + drop)
@@ -103,7 +95,7 @@ def tennis_ball(g: float = 9.8) -> Problem:
 
 @scene
 def balls_in_a_box(count: int = 64, seed: int = 0) -> Problem:
-    """Sixty-four balls in a flat box of one metre, past each other, between walls that give back all they get."""
+    """Sixty-four balls in a square box of one metre with elastic walls; they do not collide with each other."""
     radius, side = 0.02, 1.0
     lower, upper = radius, side - radius
     random = np.random.default_rng(seed)
@@ -117,7 +109,7 @@ def balls_in_a_box(count: int = 64, seed: int = 0) -> Problem:
     )
 
     def exact(t):
-        # a straight line through mirrored rooms, folded back into the first
+        # a straight line through mirror images of the box, folded back into it
         room = upper - lower
         along = (position - lower + velocity * t[:, None, None]) / room
         there = np.mod(along, 2)
@@ -130,13 +122,13 @@ def balls_in_a_box(count: int = 64, seed: int = 0) -> Problem:
         conserved=(ENERGY,),
         truths=(
             Truth(
-                "every |velocity component| is what it was [m/s]",
+                "every |velocity component| is conserved [m/s]",
                 lambda f: np.abs(f.velocity[-1]),
                 np.abs(velocity),
                 1e-12,
             ),
             Truth(
-                "none leaves the box [m]",
+                "no ball leaves the box [m]",
                 lambda f: np.maximum(np.abs(f.position - side / 2) - side / 2 + radius, 0),
                 0.0,
                 1e-12,
@@ -148,7 +140,7 @@ def balls_in_a_box(count: int = 64, seed: int = 0) -> Problem:
 @scene
 def sled(angle: float = 0.3, g: float = 9.8) -> Problem:
     """Five sleds on a slope of 0.3 rad with dry friction: one sticks, the others slide, stop, or come back down."""
-    # those at rest stick where μ_s > tan(angle) = 0.309; so do those that have come to rest
+    # sleds at rest, from the start or after they have stopped, stick where μ_s > tan(angle) = 0.309
     static = np.array([0.35, 0.20, 0.50, 0.50, 0.20])
     kinetic = np.array([0.30, 0.10, 0.45, 0.40, 0.10])
     uphill = np.array([0.0, 0.0, -2.0, 3.0, 3.0])
@@ -164,11 +156,7 @@ def sled(angle: float = 0.3, g: float = 9.8) -> Problem:
             ),
         ),
     )
-    # first against the slip until it stops, then down the slope unless static friction holds
-    way = np.sign(uphill)
-    braking = -g * np.sin(angle) - way * kinetic * g * np.cos(angle)
-    stop = np.where(way == 0, 0.0, -uphill / np.where(way == 0, 1.0, braking))
-    down = np.where(static > np.tan(angle), 0.0, -g * (np.sin(angle) - kinetic * np.cos(angle)))
+    braking, stop, down = _solve_slides(angle, g, static, kinetic, uphill)
 
     def exact(t):
         t = t[:, None]
@@ -177,22 +165,18 @@ def sled(angle: float = 0.3, g: float = 9.8) -> Problem:
         speed = np.where(t < stop, uphill + braking * t, down * after)
         return Particles(along[..., None] * slope, speed[..., None] * slope)
 
+    stopping = (uphill**2 / (2 * np.abs(braking)))[2:4]
     distance = lambda flight: np.linalg.norm(flight.position - flight.position[0], axis=-1)  # noqa: E731
     return Problem(
         sleds,
         duration=2.5,
         exact=exact,
         truths=(
-            Truth("holds still below the friction angle [m]", lambda f: distance(f)[:, 0], 0.0, 1e-12),
+            Truth("does not move below the friction angle [m]", lambda f: distance(f)[:, 0], 0.0, 1e-12),
+            Truth("stops after v²/(2g(μ_k cos θ ∓ sin θ)) [m]", lambda f: distance(f)[-1, 2:4], stopping, 1e-9),
+            Truth("stays at rest when it has stopped [m/s]", lambda f: f.velocity[-1, [0, 2, 3]], 0.0, 0.0),
             Truth(
-                "stops after v²/(2g(μ_k cos θ ∓ sin θ)), downhill and uphill [m]",
-                lambda f: distance(f)[-1, 2:4],
-                (uphill**2 / (2 * np.abs(braking)))[2:4],
-                1e-9,
-            ),
-            Truth("lies still when it has stopped [m/s]", lambda f: f.velocity[-1, [0, 2, 3]], 0.0, 0.0),
-            Truth(
-                "comes back down at g(sin θ - μ_k cos θ) (t - stop) [m/s]",
+                "slides back down at g(sin θ - μ_k cos θ) (t - stop) [m/s]",
                 lambda f: f.velocity[-1, 4] @ slope,
                 down[4] * (2.5 - stop[4]),
                 1e-9,
@@ -201,27 +185,36 @@ def sled(angle: float = 0.3, g: float = 9.8) -> Problem:
     )
 
 
+def _solve_slides(angle, g, static, kinetic, uphill):
+    """Acceleration along the slope until a sled stops [m/s²], when that is [s], and the acceleration from there on [m/s²]."""
+    way = np.sign(uphill)
+    braking = -g * np.sin(angle) - way * kinetic * g * np.cos(angle)
+    stop = np.where(way == 0, 0.0, -uphill / np.where(way == 0, 1.0, braking))
+    down = np.where(static > np.tan(angle), 0.0, -g * (np.sin(angle) - kinetic * np.cos(angle)))
+    return braking, stop, down
+
+
 class _Downdraught(NamedTuple):
-    """Vertical motion in air that comes down at `wind` [m/s], faster than any ball: v + wind = v_t tan(φ₀ - gt/v_t)."""
+    """Vertical motion in air that moves down at `wind` [m/s], faster than any ball: v + wind = v_t tan(φ₀ - gt/v_t)."""
 
     g: float
     wind: float
     terminal: float
 
     def after(self, t, velocity):
-        """Height gained [m] and velocity [m/s] at a time after a start at a velocity, upwards positive."""
+        """Height gained [m] and velocity [m/s] at a time t [s] after a start at a velocity, upwards positive."""
         start = np.arctan((velocity + self.wind) / self.terminal)
         now = start - self.g * t / self.terminal
         height = self.terminal**2 / self.g * np.log(np.cos(now) / np.cos(start)) - self.wind * t
         return height, self.terminal * np.tan(now) - self.wind
 
     def climb(self, velocity):
-        """Height at which a start at a velocity turns round [m]."""
+        """Height to which a start at a velocity rises [m]."""
         turn = np.arctan((velocity + self.wind) / self.terminal) - np.arctan(self.wind / self.terminal)
         return self.after(self.terminal / self.g * turn, velocity)[0]
 
     def landing(self, height, velocity):
-        """Time until the floor is met from a height [s]: Newton's method from the time in a vacuum, which is later."""
+        """Time to fall to the floor from a height [s]: Newton's method from the time in a vacuum, which is later."""
         t = (velocity + np.sqrt(velocity**2 + 2 * self.g * height)) / self.g
         for _ in range(20):
             gained, speed = self.after(t, velocity)

@@ -1,4 +1,4 @@
-"""The gallery to read and to look at: what each scene is, how large, and by what it is known to be right; its pictures."""
+"""The gallery as a list and as a page: what each scene is, how large, what its results are tested against; its pictures."""
 
 import html
 from collections.abc import Iterable, Iterator
@@ -6,13 +6,14 @@ from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
 
+from physjax.physics.rigid.spatial import RigidBodies
 from physjax.physics.springs.springs import Springs
 from physjax.scenes.registry import SCENES, title
 from physjax.study.problem import Problem
 
 
 class Entry(NamedTuple):
-    """A scene by name: its one-line description, how large it is, and the truths that it is tested by."""
+    """A scene by name: its one-line description, its size, and the truths that it is tested against."""
 
     name: str
     title: str
@@ -28,7 +29,7 @@ class Entry(NamedTuple):
 
 
 def describe_scene(name: str) -> tuple[Entry, Problem]:
-    """What is known of a scene, and the scene itself, in float64."""
+    """The entry of a scene, and the scene itself, in float64."""
     import jax
 
     with jax.enable_x64(True):
@@ -41,7 +42,7 @@ def describe_scene(name: str) -> tuple[Entry, Problem]:
 def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception | None]]:
     """Write `name.png` and `name.gif` of each scene, and last a page `index.html` with all of them.
 
-    Yields each name when it is done, with what went wrong if something did: the others are drawn all the same.
+    Yields each name when it is done, with the exception if it failed: the other scenes are drawn all the same.
     """
     from physjax.files import write_atomically
 
@@ -50,7 +51,7 @@ def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception 
         error = None
         try:
             cards.append(_render_card(_draw_scene(name, folder)))
-        except Exception as reason:  # whatever it is, it is handed on, and the next scene is drawn
+        except Exception as reason:  # any failure is handed on, and the next scene is drawn
             error = reason
             cards.append(_render_card(Entry(name, title(name), "", f"could not be drawn: {reason}"), drawn=False))
         yield name, error
@@ -59,7 +60,7 @@ def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception 
 
 
 def _draw_scene(name: str, folder: Path) -> Entry:
-    """Run a scene as its own reference and write both pictures."""
+    """Run a scene by its own reference method and write both pictures."""
     from matplotlib import pyplot as plt
 
     from physjax.files import write_atomically
@@ -76,12 +77,12 @@ def _draw_scene(name: str, folder: Path) -> Entry:
 
 
 def _describe_size(problem: Problem) -> str:
-    """How many of what, in how many dimensions, and for how long."""
+    """The number of particles or bodies, of dimensions and of springs, and the duration."""
     from physjax.text import format_seconds
 
     state, forces = problem.scene.state, problem.scene.forces
     lanes = state.position[..., 0].size
-    one, many = ("body", "bodies") if hasattr(state, "orientation") else ("particle", "particles")
+    one, many = ("body", "bodies") if isinstance(state, RigidBodies) else ("particle", "particles")
     words = f"{lanes} {one if lanes == 1 else many}"
     springs = sum(len(force.pairs) for force in forces if isinstance(force, Springs))
     joined = f", {springs} spring{'s' * (springs > 1)}" if springs else ""
@@ -115,7 +116,7 @@ img { display: block; width: 100%; height: 260px; object-fit: contain; }
 .small { font-size: .85em; color: #555; }
 </style>
 <h1>physjax: the gallery</h1>
-<p>Each scene, and the truths that it is tested by. Press a picture to play it.</p>
+<p>Each scene, and the truths that it is tested against. Press a picture to play it.</p>
 <main>
 __CARDS__
 </main>

@@ -1,4 +1,4 @@
-"""Rope and cloth: they hang, fly, and lie over things."""
+"""Ropes and cloth that hang, fly in the wind, and drape over a ball."""
 
 import jax
 import jax.numpy as jnp
@@ -17,24 +17,13 @@ from physjax.study.problem import Problem, Truth
 def hanging_rope(
     nodes: int = 25, span: float = 1.0, length: float = 1.3, stiffness: float = 1e4, mass: float = 1.0, g: float = 9.8
 ) -> Problem:
-    """A rope between two nails, let go with a corner in it, that comes to rest in the air: an elastic catenary.
+    """A rope between two nails, released with a corner in it, that comes to rest as an elastic catenary.
 
-    The air's drag is what brings it to rest; the rope itself has no friction.
+    Drag of the air brings it to rest; the rope itself is undamped.
     """
     rope = lattices.rope((-span / 2, 0.0), (span / 2, 0.0), nodes, mass=mass, stiffness=stiffness, length=length)
     along = np.linspace(0.0, length, nodes)
-    # pulled tight into a corner, off the middle
-    left, right = 0.65 * length, 0.35 * length
-    corner = (left**2 - right**2) / (2 * span)
-    deep = -np.sqrt(left**2 - (corner + span / 2) ** 2)
-    shape = np.stack(
-        [
-            np.interp(along, (0, left, length), (-span / 2, corner, span / 2)),
-            np.interp(along, (0, left, length), (0, deep, 0)),
-        ],
-        axis=-1,
-    )
-    start = jnp.asarray(shape)
+    start = jnp.asarray(_pull_into_corner(along, span))
     hanging = Scene(
         Particles(start, jnp.zeros_like(start)),
         mass=rope.mass,
@@ -42,31 +31,32 @@ def hanging_rope(
         pinned=rope.nodes["ends"],
     )
     curve = elastic_catenary(along, span, mass * g, stiffness * length / (nodes - 1))
+    carried = mass * g * (nodes - 2) / (nodes - 1)
     return Problem(
         hanging,
         duration=4.0,
         truths=(
-            Truth(
-                "comes to rest in a catenary [length of the rope]",
-                lambda f: (f.position[-1] - curve) / length,
-                0.0,
-                1e-3,
-            ),
-            Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-6),
-            Truth(
-                "the nails carry its weight, but for the shares that rest on them [N]",
-                _measure_pinned_load,
-                mass * g * (nodes - 2) / (nodes - 1),
-                1e-6,
-            ),
+            Truth("comes to rest in a catenary [rope lengths]", lambda f: (f.position[-1] - curve) / length, 0.0, 1e-3),
+            Truth("is at rest at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-6),
+            Truth("the nails carry its weight without its pinned nodes [N]", _measure_pinned_load, carried, 1e-6),
         ),
     )
 
 
-def elastic_catenary(along: np.ndarray, span: float, weight: float, stiffness: float) -> np.ndarray:
-    """Points of a rope that hangs between (±span/2, 0) [m], at the distances `along` it when it is slack, `(points, 2)`.
+def _pull_into_corner(along: np.ndarray, span: float) -> np.ndarray:
+    """Points of a rope that is pulled taut into a corner off the middle, at the distances `along` it, `(points, 2)` [m]."""
+    length = along[-1]
+    left, right = 0.65 * length, 0.35 * length
+    corner = (left**2 - right**2) / (2 * span)
+    depth = -np.sqrt(left**2 - (corner + span / 2) ** 2)
+    x = np.interp(along, (0, left, length), (-span / 2, corner, span / 2))
+    return np.stack([x, np.interp(along, (0, left, length), (0, depth, 0))], axis=-1)
 
-    `weight` W [N], `stiffness` EA [N]: force for each unit of strain. H. M. Irvine, Cable Structures, 1981, section 2.3:
+
+def elastic_catenary(along: np.ndarray, span: float, weight: float, stiffness: float) -> np.ndarray:
+    """Points of a rope that hangs between (±span/2, 0) [m], at the unstretched distances `along` it [m], `(points, 2)`.
+
+    `weight` W [N], `stiffness` EA [N]: force per strain. H. M. Irvine, Cable Structures, 1981, section 2.3:
     with s from one end, H the horizontal pull and V = W/2,
     x = Hs/EA + (HL/W)(asinh(V/H) - asinh((V - Ws/L)/H)), y = -(Ws/EA)(V/W - s/2L) - (HL/W)(√(1 + V²/H²) - √(1 + (V - Ws/L)²/H²)).
     """
@@ -79,7 +69,7 @@ def elastic_catenary(along: np.ndarray, span: float, weight: float, stiffness: f
         return np.stack([x - span / 2, -sag], axis=-1)
 
     low, high = 1e-6 * weight, 1e6 * weight
-    for _ in range(200):  # the span grows with the pull
+    for _ in range(200):  # bisection of log H: the span grows with the pull
         pull = np.sqrt(low * high)
         low, high = (pull, high) if points(pull)[-1, 0] < span / 2 else (low, pull)
     return points(pull)
@@ -87,7 +77,7 @@ def elastic_catenary(along: np.ndarray, span: float, weight: float, stiffness: f
 
 @scene
 def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float = 9.8) -> Problem:
-    """A cloth on two nails, let go from the level: it swings down, folds and hangs still."""
+    """A cloth on two nails, released from the horizontal: it swings down, folds and comes to rest."""
     sheet = lattices.cloth(
         side, side, nodes, nodes, mass=mass, structural=50.0, shear=20.0, bend=5.0, damping=0.05,
         corner=(-side / 2, 0.0, 0.0), down=(0.0, 0.0, 1.0),
@@ -106,8 +96,8 @@ def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float
         duration=5.0,
         looks=sheet,
         truths=(
-            Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 2e-6),
-            Truth("the nails carry the weight of the rest [N]", _measure_pinned_load, weight, 1e-6),
+            Truth("is at rest at the end [m/s]", lambda f: f.velocity[-1], 0.0, 2e-6),
+            Truth("the nails carry the weight of the other nodes [N]", _measure_pinned_load, weight, 1e-6),
             Truth(
                 "left and right mirror each other [m]",
                 lambda f: f.position - f.position[:, mirrored] * [-1.0, 1.0, 1.0],
@@ -120,9 +110,9 @@ def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float
 
 @scene
 def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) -> Problem:
-    """A flag of 0.9 by 0.6 m on a pole, in a wind of 6 m/s that turns its fall into waves.
+    """A flag of 0.9 by 0.6 m on a pole, flapping in a wind of 6 m/s.
 
-    Air presses as |u·n| (u·n), whose slope has a corner where a face turns its other side to the wind.
+    The force of the air, |u·n| (u·n), is not smooth where a face turns its other side to the wind.
     """
     sheet = lattices.cloth(
         0.9, 0.6, rows, columns, mass=0.06, structural=100.0, shear=30.0, damping=0.02, corner=(0.0, 0.6, 0.0)
@@ -141,13 +131,20 @@ def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) ->
         truths=(
             Truth("stays on its pole [m]", lambda f: f.position[:, pole] - f.position[0, pole], 0.0, 0.0),
             Truth(
-                "no thread is stretched by more than a tenth [1]",
+                "no spring is stretched by more than a tenth [1]",
                 lambda f: np.maximum(_strain(f.scene.forces[1], _stack_states(f)), 0.0),
                 0.0,
                 0.1,
             ),
-            Truth("momentum is what air, weight and pole gave [kg m/s]", _momentum_residual, 0.0, 2e-3),
-            Truth("energy is what the air gave, less what the threads lost [J]", _energy_residual, 0.0, 1e-3),
+            Truth(
+                "the change of momentum is the impulse of air, weight and pole [kg m/s]", _momentum_residual, 0.0, 2e-3
+            ),
+            Truth(
+                "the change of energy is the work of the air less the loss in the springs [J]",
+                _energy_residual,
+                0.0,
+                1e-3,
+            ),
             Truth(
                 "flies downwind: the free edge is far from the pole [m]",
                 lambda f: f.position[-1, sheet.nodes["right"], 0].mean(),
@@ -161,11 +158,11 @@ def flag(rows: int = 6, columns: int = 9, speed: float = 6.0, g: float = 9.8) ->
 
 @scene
 def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, g: float = 9.8) -> Problem:
-    """A cloth falls on a ball on the floor, slips a little, and comes to rest over it, with two folds.
+    """A cloth that falls on a ball on the floor, slips a little, and comes to rest over it, with two folds.
 
-    Nodes touch, not the faces between them: the ball and the floor that are seen are a centimetre smaller and deeper.
-    Touches are answered at the end of a step, where friction takes the velocity, but not the way ½a dt² that was gone
-    within it: what lies on a slope creeps at up to g dt.
+    Nodes are in contact, not the faces between them: the ball and the floor are drawn a centimetre smaller and deeper.
+    Contacts are resolved at the end of a step, where friction removes the velocity but not the displacement ½a dt² within
+    the step: nodes on a slope creep at up to g dt.
     """
     sheet = lattices.cloth(
         side, side, nodes, nodes, mass=0.15, structural=50.0, shear=20.0, bend=10.0, damping=0.1,
@@ -189,7 +186,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
             Truth("no node is in the ball [m]", into(0), 0.0, 1e-12),
             Truth("no node is under the floor [m]", into(1), 0.0, 1e-12),
             Truth(
-                "lies still at the end, but for a creep of at most g dt [g dt]",
+                "creeps at the end by at most g dt [g dt]",
                 lambda f: np.abs(f.velocity[-1]) / (g * f.dt),
                 0.0,
                 1.0,
@@ -206,7 +203,7 @@ def cloth_over_sphere(nodes: int = 13, side: float = 0.7, radius: float = 0.25, 
 
 
 def _measure_pinned_load(flight):
-    """Vertical force of the springs on what is pinned, at the end [N], downwards positive."""
+    """Vertical force of the springs on the pinned nodes at the end [N], downwards positive."""
     pull = _evaluate_terms(flight)[1][-1]
     return -np.sum(pull[np.asarray(flight.scene.pinned), 1])
 
@@ -224,14 +221,14 @@ _energies = jax.jit(jax.vmap(lambda scene, state: total(scene, 0.0, state), (Non
 
 
 def _evaluate_terms(flight, still=False):
-    """The force of each term of the scene on each node at every frame [N]; of nodes that do not move, if so told."""
+    """The force of each term of the scene on each node at every frame [N]; with `still`, as if all nodes were at rest."""
     states = _stack_states(flight)
     states = states._replace(velocity=0.0 * states.velocity) if still else states
     return [np.asarray(term) for term in _loads(flight.scene, states)]
 
 
 def _momentum_residual(flight):
-    """Change of momentum from start to end, less the impulse of all forces on what is free [kg m/s]."""
+    """Change of momentum from start to end, less the impulse of all forces on the free nodes [kg m/s]."""
     mass, free = np.asarray(flight.scene.mass)[:, None], ~np.asarray(flight.scene.pinned)
     change = np.sum(mass * (flight.velocity[-1] - flight.velocity[0]), axis=0)
     return change - _integrate(flight.time, sum(_evaluate_terms(flight))[:, free].sum(axis=1))

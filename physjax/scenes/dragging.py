@@ -1,4 +1,4 @@
-"""A ragdoll, in metres: x the way it is dragged, y up, z to its right."""
+"""A ragdoll, in metres: x in the direction it is dragged, y up, z to its right."""
 
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity
+from physjax.checks import Numbers, quantity
 from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.physics import contacts, forces, rigid
@@ -20,7 +20,7 @@ from physjax.study.problem import Problem, Truth
 from physjax.vectors import broadcast_vector, scale
 
 LIMBS = {
-    # mass [kg], radius and length between the ends of its axis [m], where its middle lies along x and z [m]
+    # mass [kg], radius [m], length of the axis of its capsule [m], x and z of its centre [m]
     "torso": (32.0, 0.13, 0.36, 0.0, 0.0),
     "head": (5.0, 0.1, 0.06, 0.44, 0.0),
     "arm": (2.2, 0.05, 0.2, 0.32, 0.2),
@@ -33,7 +33,7 @@ LIMBS = {
     "other shin": (4.0, 0.055, 0.34, -0.92, -0.1),
 }
 JOINT_PLACES = (
-    # which two, and where along x and z [m]
+    # the two limbs, x and z of the joint [m]
     ("torso", "head", 0.31, 0.0),
     ("torso", "arm", 0.18, 0.2),
     ("arm", "forearm", 0.47, 0.2),
@@ -47,14 +47,14 @@ JOINT_PLACES = (
 
 
 class TowSpring(Force):
-    """A damped spring to a place that sets out softly: F = k (X - x) + c (X' - v), X = X₀ + U (t - τ(1 - e^(-t/τ)))."""
+    """A damped spring to a point that starts smoothly: F = k (X - x) + c (X' - v), X = X₀ + U (t - τ(1 - e^(-t/τ)))."""
 
     couples: ClassVar[bool] = False
-    start: Float[Array, "..."] = quantity("place at t = 0", "m", kind="place")
-    velocity: Float[Array, "..."] = quantity("velocity of the place in the end", "m/s", kind="vector")
-    soft: Float[Array, "..."] = quantity("time τ to set out in", "s", above=0)
-    stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", at_least=0)
-    damping: Float[Array, "..."] = quantity("damping c", "kg/s", at_least=0)
+    start: Numbers = quantity("position at t = 0", "m", kind="place")
+    velocity: Numbers = quantity("final velocity of the point", "m/s", kind="vector")
+    soft: Numbers = quantity("time constant τ of the start", "s", above=0)
+    stiffness: Numbers = quantity("stiffness k", "N/m", at_least=0)
+    damping: Numbers = quantity("damping c", "kg/s", at_least=0)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The pull [N]."""
@@ -68,18 +68,12 @@ class TowSpring(Force):
 def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Problem:
     """A ragdoll of ten limbs and nine ball joints, dragged over the ground by one hand.
 
-    Its joints are stiff springs, the hand's lead a soft one; the ends of its limbs slide.
+    The joints are stiff springs, the tow a soft one; the ends of the limbs slide with friction.
     """
-    names = list(LIMBS)
-    mass, radius, length, x, z = np.array(list(LIMBS.values())).T
-    height = radius.max()
-    middle = np.stack([x, np.full_like(x, height), z], axis=-1)
+    mass, radius, length, middle, joints = _build_limbs()
     moments = [inertia.capsule(*limb, axis=0).principal for limb in zip(mass, radius, length, strict=True)]
     limbs = inertia.Inertia(mass, jnp.stack(moments))
-    pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINT_PLACES])
-    where = np.array([[x, height, z] for *_, x, z in JOINT_PLACES])
-    joints = rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0)
-    towed = np.array(names) == "forearm"
+    towed = np.array(list(LIMBS)) == "forearm"
     hand = np.array([length[towed][0] / 2, 0.0, 0.0])
     tow_spring = TowSpring(
         middle[towed][0] + hand, (speed, 0.0, 0.0), soft=0.3, stiffness=1e4 * towed, damping=500.0 * towed
@@ -95,7 +89,7 @@ def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Proble
     )
     duration, frames = 4.0, 64
 
-    def parted(flight):
+    def joint_error(flight):
         return jax.vmap(joints.error)(jax.tree.map(jnp.asarray, flight.state))
 
     def pace(flight):
@@ -112,10 +106,27 @@ def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Proble
         dragged,
         duration=duration,
         truths=(
-            Truth("at no frame has a joint parted by a millimetre [m]", parted, 0.0, 1e-3),
-            Truth("comes along as fast as the hand goes, on average [relative]", pace, 1.0, 0.02),
+            Truth("no joint opens by a millimetre at any frame [m]", joint_error, 0.0, 1e-3),
+            Truth("moves with the mean velocity of the hand [relative]", pace, 1.0, 0.02),
             Truth("pulls with F_x/(μ(mg - F_y)) of 0.9 to 1: some of the slip is sideways [1]", pull, 0.95, 0.05),
         ),
         looks=[solids.capsule(*limb, axis=0) for limb in zip(radius, length, strict=True)],
         frames=frames,
+    )
+
+
+def _build_limbs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, rigid.Joints]:
+    """Mass [kg], radius, length and centre [m] of each limb, lying on the ground, and the joints between them."""
+    names = list(LIMBS)
+    mass, radius, length, x, z = np.array(list(LIMBS.values())).T
+    height = radius.max()
+    middle = np.stack([x, np.full_like(x, height), z], axis=-1)
+    pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINT_PLACES])
+    where = np.array([[x, height, z] for *_, x, z in JOINT_PLACES])
+    return (
+        mass,
+        radius,
+        length,
+        middle,
+        rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0),
     )

@@ -1,4 +1,4 @@
-"""Cars on four springs, in metres: x the way they go, y up, z to their right."""
+"""Cars on four springs, in metres: x forward, y up, z to their right."""
 
 from itertools import product
 
@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity
+from physjax.checks import Numbers, quantity
 from physjax.physics import contacts, forces, rigid
 from physjax.physics.rigid import inertia
 from physjax.physics.rigid.inertia import Inertia
@@ -22,35 +22,37 @@ from physjax.vectors import cross, dot, norm, scale, stack_components, unit
 
 BODY_SIZE = np.array([3.0, 1.0, 1.7])
 BODY_PARTS = [
-    # size and place [m] of what the body is made of
+    # size and centre [m] of the boxes that the body is made of
     (np.array([3.0, 0.55, 1.7]), np.array([0.0, -0.225, 0.0])),
     (np.array([1.6, 0.45, 1.5]), np.array([0.0, 0.275, 0.0])),
 ]
 WHEEL_MOUNTS = np.array([[x, -0.3, z] for x in (-1.3, 1.3) for z in (-0.7, 0.7)])
 WHEEL_RADIUS = 0.35
 AHEAD, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+BRAKE_FADE_SPEED = 0.1
+"""Speed below which brakes fade [m/s], so that their force has no jump where a car stands still."""
 MIN_UP_COSINE = 0.2
-"""Of a car that leans so far that less than this of its own up points upwards, no wheel is under it."""
+"""Cosine of the tilt [1] below which a car has no wheel under it, and its springs do not act."""
 
 
 class Suspension(rigid.Load):
-    """Four springs down to flat ground at y = 0 and the tyres below: N = k s - c v_y >= 0 each, s [m] how far it is pressed in.
+    """Four damped springs with tyres on flat ground at y = 0: N = k s - c v_y >= 0 each, for a compression s [m].
 
-    The wheels want together the force `throttle` ahead until `brakes_at`, then `brake` against the motion; across, a
-    tyre resists its slip with `grip`; both together stay within μN.
+    Until `brakes_at` the tyres together drive with the force `throttle`, then they `brake` against the motion; laterally
+    each resists slip with `grip`. The horizontal force of a tyre is limited to μN.
     """
 
-    stiffness: Float[Array, "..."] = quantity("stiffness k of each spring", "N/m", above=0)
-    damping: Float[Array, "..."] = quantity("damping c of each spring", "kg/s", at_least=0)
-    length: Float[Array, "..."] = quantity("length of a free spring with its wheel", "m", above=0)
-    throttle: Float[Array, "..."] = quantity("driving force", "N")
-    brake: Float[Array, "..."] = quantity("braking force", "N", at_least=0)
-    brakes_at: Float[Array, "..."] = quantity("when the brakes are put on", "s")
-    grip: Float[Array, "..."] = quantity("resistance of a tyre to slip across", "kg/s", at_least=0)
-    friction: Float[Array, "..."] = quantity("friction μ of the tyres", "1", at_least=0)
+    stiffness: Numbers = quantity("stiffness k of each spring", "N/m", above=0)
+    damping: Numbers = quantity("damping c of each spring", "kg/s", at_least=0)
+    length: Numbers = quantity("unloaded length of a spring with its wheel", "m", above=0)
+    throttle: Numbers = quantity("driving force", "N")
+    brake: Numbers = quantity("braking force", "N", at_least=0)
+    brakes_at: Numbers = quantity("time at which the brakes are applied", "s")
+    grip: Numbers = quantity("lateral resistance of a tyre to slip", "kg/s", at_least=0)
+    friction: Numbers = quantity("friction μ of the tyres", "1", at_least=0)
 
     def wrench(self, t: ArrayLike, bodies: rigid.RigidBodies, inertia: Inertia) -> rigid.Wrench:
-        """The force of each tyre where it touches, and its torque."""
+        """The sum of the tyres' forces and torques, each at its point of contact."""
         ahead, up = (to_world_frame(bodies, axis) for axis in (AHEAD, UP))
         velocity, omega = scale(1 / inertia.mass, bodies.momentum), rigid.angular_velocity(bodies, inertia)
 
@@ -64,11 +66,12 @@ class Suspension(rigid.Load):
         return jax.tree.map(sum, jax.vmap(wheel)(jnp.asarray(WHEEL_MOUNTS, bodies.dtype)))
 
     def _tyre_force(self, t: ArrayLike, pressed: Array, speed: Array, ahead: Array) -> Array:
+        """Normal and horizontal force of a tyre [N], for a compression [m] and a velocity of its contact point [m/s]."""
         push = jnp.where(pressed > 0, self.stiffness * pressed - self.damping * speed[..., 1], 0.0)
         push, none = jnp.maximum(push, 0.0), jnp.zeros_like(push)
         ahead = unit(stack_components([ahead[..., 0], none, ahead[..., 2]]))
         aside = stack_components([-ahead[..., 2], none, ahead[..., 0]])
-        stops = -self.brake * jnp.tanh(dot(speed, ahead) / 0.1)  # without a jump where the car stands
+        stops = -self.brake * jnp.tanh(dot(speed, ahead) / BRAKE_FADE_SPEED)
         drive = jnp.where(t < self.brakes_at, self.throttle, stops) / len(WHEEL_MOUNTS)
         pull = scale(drive, ahead) - scale(self.grip * dot(speed, aside), aside)
         size, most = norm(pull), self.friction * push
@@ -77,10 +80,10 @@ class Suspension(rigid.Load):
 
 
 class Kerb(contacts.Surface):
-    """Flat ground at y = 0 and a step up across the way: its face at x = `at`, its top at y = `height`, its edge sharp."""
+    """Flat ground at y = 0 and a step up at x = `at` to y = `height`, with a sharp edge."""
 
-    at: Float[Array, "..."] = quantity("place of the face", "m")
-    height: Float[Array, "..."] = quantity("height", "m", above=0)
+    at: Numbers = quantity("place of the face", "m")
+    height: Numbers = quantity("height", "m", above=0)
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
         """Distance to the nearest of ground, face, top and edge [m]."""
@@ -90,7 +93,7 @@ class Kerb(contacts.Surface):
         return jnp.minimum(position[..., 1], kerb)
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
-        """Away from the nearest."""
+        """Away from the nearest of them."""
         before, above = self._face_distances(position)
         low = position[..., 1] <= self.signed_distance(t, position)
         edge, face = ~low & (before > 0) & (above > 0), ~low & (before > above)
@@ -98,14 +101,17 @@ class Kerb(contacts.Surface):
         y = jnp.where(edge, above, jnp.where(face, 0.0, 1.0))
         return unit(stack_components([-x, y, jnp.zeros_like(x)]))
 
-    def profile(self, low: float, high: float) -> np.ndarray:
-        """The line in the plane of x and y between two places along x [m], the same at every z."""
+    def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+        """Ground, face and top from side to side of the box: they stay sharp, whatever grid the box is drawn with."""
         at, height = float(self.at), float(self.height)
-        if not low < at < high:
-            return np.array([[low, height * (at <= low)], [high, height * (at <= low)]])
-        return np.array([[low, 0.0], [at, 0.0], [at, height], [high, height]])
+        line = np.array([[low[0], height * (at <= low[0])], [high[0], height * (at < high[0])]])
+        if low[0] < at < high[0]:
+            line = np.array([line[0], [at, 0.0], [at, height], line[1]])
+        near, far = (np.column_stack([line, np.full(len(line), side)]) for side in (low[2], high[2]))
+        return list(np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=1))
 
     def _face_distances(self, position: Array) -> tuple[Array, Array]:
+        """Signed distances in front of the face and above the top [m]."""
         return self.at - position[..., 0], position[..., 1] - self.height
 
 
@@ -113,8 +119,8 @@ class Kerb(contacts.Surface):
 def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
     """Cars on springs: one stands, one drives and brakes, one rebounds from a kerb, one slides into it and flips.
 
-    Wheels turn freely, so that a kerb takes nothing by friction: v' = v (1 - (1 + K_r)/(1 + m h²/I)), with h from the
-    hubs to the centre of mass and I of the pitch. A body is as heavy and as hard to turn as the box around it.
+    Wheels turn freely, so a kerb has no friction: v' = v (1 - (1 + K_r)/(1 + m h²/I)), with h from the hubs to the centre
+    of mass and I about the pitch axis. The moments of inertia are those of the box around the body.
     """
     mass, stiffness, length, restitution = 1200.0, 6e4, 0.55, 0.4
     body = inertia.box(mass, BODY_SIZE)
@@ -142,7 +148,7 @@ def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
     corners = np.concatenate([_corners(size) + place for size, place in BODY_PARTS])
     outer = np.isclose(np.abs(corners[:, 1]), BODY_SIZE[1] / 2)
     step, rough = (13.0, 0.4), contacts.Coulomb(0.5, 0.5)
-    touches = (
+    kerbs = (
         rigid.SurfaceContact(rigid.ContactPoints(corners[outer]), Kerb(*step, restitution=0.2, coulomb=rough)),
         rigid.SurfaceContact(rigid.ContactPoints(hubs, 0.3), Kerb(*step, restitution=restitution)),
     )
@@ -161,25 +167,27 @@ def car(speed: float = 5.0, friction: float = 0.9, g: float = 9.8) -> Problem:
         return np.diff(ends)[0] * 2 * friction * g / pace(flight, brakes, 1) ** 2
 
     return Problem(
-        Scene(start, body, (forces.Gravity(g), springs), touches),
+        Scene(start, body, (forces.Gravity(g), springs), kerbs),
         duration,
         truths=(
             Truth(
-                "one rests at the sag mg/(4k) [m]",
+                "the first rests at the sag mg/(4k) [m]",
                 lambda f: length - WHEEL_MOUNTS[0, 1] - f.position[-1, 0, 1],
                 sag,
                 1e-9,
             ),
-            Truth("one drives as fast as Ft/m [relative]", lambda f: pace(f, brakes - 1, 1) / gained, 1.0, 1e-6),
+            Truth("the second drives at Ft/m [relative]", lambda f: pace(f, brakes - 1, 1) / gained, 1.0, 1e-6),
             Truth("and brakes within v²/(2μg) [relative]", way, 1.0, 0.02),
             Truth(
-                "one rebounds from the kerb at v' [relative]",
+                "the third rebounds from the kerb at v' [relative]",
                 lambda f: pace(f, -1, 2) / speed,
                 1 - (1 + restitution) / (1 + lever),
                 1e-6,
             ),
-            Truth("one flips: its up points down in the end [1]", lambda f: _up_component(f)[-1, 3], -1.0, 0.01),
-            Truth("the others never lean far [1]", lambda f: _up_component(f)[:, :3], 1.0, 0.05),
+            Truth(
+                "the fourth flips: its own up points down at the end [1]", lambda f: _up_component(f)[-1, 3], -1.0, 0.01
+            ),
+            Truth("the others never tilt far [1]", lambda f: _up_component(f)[:, :3], 1.0, 0.05),
         ),
         looks=parts[0].joined(*parts[1:]),
         frames=frames,
@@ -192,6 +200,6 @@ def _corners(size: np.ndarray) -> np.ndarray:
 
 
 def _up_component(flight: Trajectory) -> np.ndarray:
-    """How much of each car's up points upwards, at every frame: 1 - 2(x² + z²) of its quaternion."""
+    """Cosine of each car's tilt, at every frame: 1 - 2(x² + z²) of its quaternion."""
     _, x, _, z = np.moveaxis(flight.state.orientation, -1, 0)
     return 1 - 2 * (x * x + z * z)

@@ -1,4 +1,4 @@
-"""Runs that must fail: the step is too long for the method, and the figure that says so is known beforehand."""
+"""Runs that must fail: most have a step beyond a stability limit that is known from theory."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,9 +21,9 @@ OMEGA = float(np.sqrt(15.0))
 
 
 class Failure(NamedTuple):
-    """A scene under a method and a step dt [s] that fails within `steps`, for a `cause` and through a `force`.
+    """A scene under a method with a step dt [s] that fails within `steps`, for a `cause` and due to a `force`.
 
-    `limit` [s] is the longest step that would do, from theory (0: none would, None: it is not dt alone).
+    `limit` [s] is the longest stable step from theory (0: none is, None: it does not depend on dt alone).
     """
 
     scene: Scene
@@ -41,81 +41,81 @@ class Failure(NamedTuple):
 
 @failure
 def euler_on_a_spring(dt: float = 0.1) -> Failure:
-    """Explicit Euler on a spring without damping: the swing grows √(1 + ω²dt²) times a step, at any step."""
+    """Explicit Euler on an undamped spring: the amplitude grows by √(1 + ω²dt²) per step, for any dt."""
     return Failure(_build_spring(), methods.euler, dt, 1200, "stiffness", "Anchor", 0.0)
 
 
 @failure
 def midpoint_on_a_spring(dt: float = 0.1) -> Failure:
-    """Midpoint on the same spring: the swing grows √(1 + ω⁴dt⁴/4) times a step, slowly, and for ever."""
+    """Midpoint on the same spring: the amplitude grows by √(1 + ω⁴dt⁴/4) per step, slowly but without limit."""
     return Failure(_build_spring(), methods.midpoint, dt, 1200, "stiffness", "Anchor", 0.0)
 
 
 @failure
 def semi_implicit_beyond_two(beyond: float = 1.01) -> Failure:
-    """Semi-implicit Euler with ω dt a little over 2: bounded until there, gone beyond."""
+    """Semi-implicit Euler with ω dt just above 2: stable below, unstable beyond."""
     limit = 2 / OMEGA
     return Failure(_build_spring(), methods.semi_implicit_euler, beyond * limit, 1200, "stiffness", "Anchor", limit)
 
 
 @failure
 def rk4_beyond_two_root_two(beyond: float = 1.01) -> Failure:
-    """Runge-Kutta with ω dt a little over 2√2, where it stops to lose energy and begins to gain it."""
+    """Runge-Kutta 4 with ω dt just above 2√2, where it goes from losing energy to gaining it."""
     limit = 2 * np.sqrt(2.0) / OMEGA
     return Failure(_build_spring(), methods.rk4, beyond * limit, 1200, "stiffness", "Anchor", limit)
 
 
 @failure
 def euler_on_a_damped_spring(dt: float = 7e-3) -> Failure:
-    """Explicit Euler with k = 15, b = 0.1, m = 1: the friction of 0.1 makes steps up to b/k = 6.67 ms stable, no more."""
+    """Explicit Euler with k = 15, b = 0.1, m = 1: the damping makes steps up to b/k = 6.67 ms stable, no longer ones."""
     return Failure(_build_spring(0.1), methods.euler, dt, 1200, "stiffness", "Anchor", 0.1 / 15)
 
 
 @failure
 def semi_implicit_on_a_damped_spring(dt: float = 0.515) -> Failure:
-    """Semi-implicit Euler on the same spring: k dt² + 2b dt < 4 is 509.8 ms, seventy times explicit Euler's step."""
+    """Semi-implicit Euler on the same spring: k dt² + 2b dt < 4 allows 509.8 ms, seventy times explicit Euler's step."""
     limit = (np.sqrt(0.1**2 + 4 * 15.0) - 0.1) / 15.0
     return Failure(_build_spring(0.1), methods.semi_implicit_euler, dt, 1200, "stiffness", "Anchor", limit)
 
 
 @failure
 def stiff_cloth(dt: float = 8e-3) -> Failure:
-    """A cloth of 1000 N/m at 0.1 kg a node: without damping 7 ms are stable under semi-implicit Euler, 8 are not."""
+    """A cloth of 1000 N/m with 0.1 kg per node: undamped, 7 ms are stable under semi-implicit Euler, 8 ms are not."""
     return Failure(_build_cloth(None), methods.semi_implicit_euler, dt, 1200, "stiffness", "Springs", None)
 
 
 @failure
 def damped_cloth(dt: float = 4e-3) -> Failure:
-    """The same cloth with damping, put in to make it calm: now the damping sets the limit, 2.2 ms."""
+    """The same cloth with damping, added to stabilise it: now the damping sets the limit, 2.2 ms."""
     return Failure(_build_cloth(10.0), methods.semi_implicit_euler, dt, 1200, "damping", "Springs", None)
 
 
 @failure
 def fast_drag(dt: float = 0.01, speed: float = 1000.0) -> Failure:
-    """Quadratic drag on a fast light body: Euler's drag of one step exceeds its momentum, and it flies back."""
+    """Quadratic drag on a fast light body: Euler's drag impulse in one step exceeds its momentum and reverses it."""
     drag = forces.QuadraticDrag(area=0.01, coefficient=0.5)
     scene = Scene(Particles(jnp.zeros(2), jnp.asarray([speed, 0.0])), mass=0.01, forces=(forces.Gravity(), drag))
-    # the rate of small changes along the path is twice |F|/(m v)
+    # F ∝ v²: the decay rate of small changes of speed is twice |F|/(m v), and Euler's limit 2 over that rate
     limit = 2 * 0.01 / (1.225 * 0.5 * 0.01 * speed)
     return Failure(scene, methods.euler, dt, 20, "damping", "QuadraticDrag", limit)
 
 
 @failure
 def close_approach(dt: float = 0.02) -> Failure:
-    """An orbit of eccentricity 0.9: no limit is broken, but the close approach is over within a few steps."""
+    """An orbit of eccentricity 0.9: no stability limit is exceeded, but the close approach has only a few steps."""
     return Failure(kepler().scene, methods.verlet, dt, 1200, "resolution", "Gravitation", None)
 
 
 @failure
 def far_from_the_origin(metres: float = 1e7) -> Failure:
-    """A ball in float32 ten thousand kilometres out: a step is lost in the last digit, and it stands still."""
+    """A ball in float32 ten thousand kilometres from the origin: each step is rounded away, and it does not move."""
     position, velocity = (jnp.asarray([number, 0.0], jnp.float32) for number in (metres, 1.0))
     return Failure(Scene(Particles(position, velocity)), methods.rk4, 0.01, 100, "rounding", "", None)
 
 
 @failure
 def blind_throw() -> Failure:
-    """Adaptive Euler that looks at velocities alone, as in the lecture: a throw of 2 s under gravity ends 4.5 m off."""
+    """Adaptive Euler with an error estimate from velocities alone: a throw of 2 s under gravity ends 4.5 m off."""
     scene = Scene(Particles(jnp.zeros(2), jnp.asarray([3.0, 10.0])), forces=(forces.Gravity(),))
     blind = methods.adaptive(methods.euler, 1e-3, 1e-3, error="velocity")
     return Failure(scene, blind, 2.0, 1, "error measure", "", None)

@@ -1,4 +1,4 @@
-"""Things thrown and things that fall."""
+"""Projectiles and falling bodies."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +67,7 @@ def fall_with_drag(mass: float = 80.0, area: float = 0.7, coefficient: float = 1
 def raindrop() -> Problem:
     """Raindrops of 34 sizes falling in still air, as measured by Gunn and Kinzer in 1949.
 
-    The drag correction grows as |v|^1.681 from rest, so no method is better than order 2.7 here, whatever it promises.
+    The drag correction grows as |v|^1.681 from rest, which is not smooth: it limits every method to order 2.7.
     """
     measured = read_table("raindrop_terminal_velocity.csv")
     radius = measured["diameter_mm"] / 2000
@@ -90,6 +90,6 @@ def raindrop() -> Problem:
         duration=6.0,
         truths=(
             Truth("0.2 to 2.2 mm: the measured speed within 5 %", lambda f: ratio(f)[spherical], 1.0, 0.05),
-            Truth("3 mm: a tenth too fast, since large drops flatten", lambda f: ratio(f)[large], 1.10, 0.02),
+            Truth("3 mm: 10 % too fast, since large drops are flattened", lambda f: ratio(f)[large], 1.10, 0.02),
         ),
     )

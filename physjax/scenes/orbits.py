@@ -1,4 +1,4 @@
-"""Bodies that attract each other."""
+"""Orbits under Newtonian gravitation."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ CONSERVED = (ENERGY, MOMENTUM, ANGULAR_MOMENTUM)
 
 @scene
 def kepler(eccentricity: float = 0.9, orbits: int = 2) -> Problem:
-    """Two equal bodies on ellipses of eccentricity 0.9: slow far out, then a close approach in a moment."""
+    """Two equal bodies on ellipses of eccentricity 0.9: slow far apart, then a short close approach."""
     e = eccentricity
     # relative orbit with semi-major axis 1 and GM = 1, from the closest point: Hairer, Lubich, Wanner, section I.2
     apart = np.array([1 - e, 0.0])
@@ -54,7 +54,7 @@ def kepler(eccentricity: float = 0.9, orbits: int = 2) -> Problem:
 
 @scene
 def figure_eight() -> Problem:
-    """Three equal bodies that chase each other along a figure eight (Chenciner and Montgomery 2000)."""
+    """Three equal bodies that follow each other along a figure eight (Chenciner and Montgomery 2000)."""
     one = np.array([0.97000436, -0.24308753])
     last = np.array([-0.93240737, -0.86473146])
     bodies = Scene(
@@ -93,7 +93,7 @@ def solar_system() -> Problem:
         forces=(gravitation,),
     )
     names = ephemeris["body"][start]
-    # what Newton lacks after ten years [km]: relativity, asteroids, the Moon as a body of its own
+    # differences to Newton's law after ten years [km]: relativity, asteroids, the Moon as a separate body
     missing = {"mercury": 1823, "venus": 901, "earthmoon": 561, "mars": 341, "jupiter": 72.2, "saturn": 15.5}
     missing |= {"uranus": 0.38, "neptune": 0.155, "pluto": 0.24}
     known = np.array([name in missing for name in names])
@@ -104,7 +104,7 @@ def solar_system() -> Problem:
         conserved=CONSERVED,
         truths=(
             Truth(
-                "ten years on, off DE421 by what Newton's law lacks, planet by planet [km]",
+                "after ten years, differs from DE421 by what Newton's law lacks, planet by planet [km]",
                 lambda flight: np.linalg.norm(flight.position[-1] - position[end], axis=-1)[known] / 1e3,
                 expected,
                 0.05 * expected,

@@ -1,4 +1,4 @@
-"""Things that swing, circle and bob."""
+"""Oscillators: springs, a chain of masses, a conical pendulum, a floating ball."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ from physjax.study.problem import Problem, Truth
 
 @scene
 def oscillator(stiffness: tuple = (1.0, 10.0, 100.0, 1000.0), mass: float = 1.0) -> Problem:
-    """Four masses on springs from light to stiff: x = cos ωt, at one step size the stiffest fails first."""
+    """Four masses on springs from soft to stiff: x = cos ωt; as the step grows, the stiffest fails first."""
     k = np.asarray(stiffness, float)
     omega = np.sqrt(k / mass)
     start = jnp.ones((k.size, 1))
@@ -36,7 +36,7 @@ def oscillator(stiffness: tuple = (1.0, 10.0, 100.0, 1000.0), mass: float = 1.0)
         conserved=(ENERGY,),
         truths=(
             Truth(
-                "back at cos ωt after the period of the lightest [m]",
+                "at cos ωt after the period of the softest [m]",
                 lambda flight: flight.position[-1, :, 0],
                 np.cos(omega * duration),
                 1e-8,
@@ -47,10 +47,10 @@ def oscillator(stiffness: tuple = (1.0, 10.0, 100.0, 1000.0), mass: float = 1.0)
 
 @scene
 def oscillator_chain(count: int = 50, stiffness: float = 40.0, mass: float = 0.1, spacing: float = 0.1) -> Problem:
-    """Fifty masses in a row between two walls, tied by springs: the first is let go, and a pulse runs to and fro.
+    """Fifty masses in a row between two walls, joined by springs: the first is released, and a pulse runs to and fro.
 
-    All modes sin(jπi/(n+1)) take part, each with its own frequency 2√(k/m) sin(jπ/(2(n+1))): the short waves are slower
-    than the long ones and stay behind.
+    All modes sin(jπi/(n+1)) take part, each with its own frequency 2√(k/m) sin(jπ/(2(n+1))): short waves are slower than
+    long ones (dispersion).
     """
     place = np.arange(count + 2)
     modes = np.arange(1, count + 1)
@@ -97,7 +97,7 @@ def oscillator_chain(count: int = 50, stiffness: float = 40.0, mass: float = 0.1
 def conical_pendulum(
     length: float = 1.0, angle: float = 0.6, mass: float = 0.5, stiffness: float = 2e3, g: float = 9.8
 ) -> Problem:
-    """A mass on a string that goes round a level circle: ω² = g/(L cosθ), the string's pull is mg/cosθ, inward mω²r."""
+    """A mass on a string in a horizontal circle: ω² = g/(L cosθ), tension mg/cosθ, centripetal force mω²r."""
     radius, omega = length * np.sin(angle), np.sqrt(g / (length * np.cos(angle)))
     pull = mass * g / np.cos(angle)
     string = Springs([[0, 1]], stiffness=stiffness, rest_length=length - pull / stiffness)
@@ -115,7 +115,7 @@ def conical_pendulum(
         v[:, 1, 0], v[:, 1, 2] = -omega * x[:, 1, 2], omega * x[:, 1, 0]
         return Particles(x, v)
 
-    def leaning(flight):
+    def tilt(flight):
         return np.arctan2(np.linalg.norm(flight.position[:, 1, ::2], axis=-1), -flight.position[:, 1, 1])
 
     def tension(flight):
@@ -127,10 +127,13 @@ def conical_pendulum(
         exact=exact,
         conserved=(ENERGY,),
         truths=(
-            Truth("leans as tanθ = ω²r/g says [rad]", leaning, np.arctan2(omega**2 * radius, g), 1e-8),
-            Truth("the string pulls with mg/cosθ [N]", tension, pull, 1e-5),
+            Truth("is at the angle tanθ = ω²r/g [rad]", tilt, np.arctan2(omega**2 * radius, g), 1e-8),
+            Truth("the tension of the string is mg/cosθ [N]", tension, pull, 1e-5),
             Truth(
-                "of which mω²r is inward [N]", lambda f: tension(f) * np.sin(leaning(f)), mass * omega**2 * radius, 1e-5
+                "its horizontal component is mω²r [N]",
+                lambda f: tension(f) * np.sin(tilt(f)),
+                mass * omega**2 * radius,
+                1e-5,
             ),
         ),
     )
@@ -138,7 +141,7 @@ def conical_pendulum(
 
 @scene
 def floating_ball(radius: float = 0.1, density: float = 400.0, drop: float = 0.3, g: float = 9.8) -> Problem:
-    """A light ball dropped into water: it dives, bobs, and floats where the water it displaces weighs what it does."""
+    """A light ball dropped into water: it dives, bobs, and floats where it displaces its own weight of water."""
     water, mass = 1000.0, density * 4 / 3 * np.pi * radius**3
     dropped = Scene(
         Particles(jnp.asarray([drop]), jnp.zeros(1)),
@@ -161,10 +164,12 @@ def floating_ball(radius: float = 0.1, density: float = 400.0, drop: float = 0.3
         dropped,
         duration=15.0,
         truths=(
-            Truth("floats as deep as Archimedes says [m]", lambda f: radius - f.position[-1, 0], depth, 1e-8),
+            Truth(
+                "floats at the depth of Archimedes' principle [m]", lambda f: radius - f.position[-1, 0], depth, 1e-8
+            ),
             Truth("displaces its own mass of water [kg]", weight_displaced, mass, 1e-6),
-            Truth("lies still at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-8),
-            Truth("its middle dived under water on the way [m]", lambda f: f.position.min(), -0.15, 0.15),
+            Truth("is at rest at the end [m/s]", lambda f: f.velocity[-1], 0.0, 1e-8),
+            Truth("its centre was under water on the way [m]", lambda f: f.position.min(), -0.15, 0.15),
         ),
         frames=128,
     )

@@ -1,6 +1,6 @@
-"""Particle systems: what is born at a rate or in a burst, flies, and dies.
+"""Particle systems: explosion, fountain, smoke, fire, sparks and snow.
 
-Each particle is compared with the closed form of its own birth, which the emitter knows for every slot and generation.
+Each particle is compared with the closed form from its own birth, which the emitter gives for every slot and generation.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ UP = (0.0, 1.0, 0.0)
 
 @scene
 def explosion(particles: int = 400, speed: float = 8.0, g: float = 9.8) -> Problem:
-    """Four hundred fragments of equal speed thrown in all directions at once: a sphere that grows and falls."""
+    """Four hundred fragments thrown in all directions at one speed: a sphere that grows and falls."""
     center = np.asarray([0.0, 20.0, 0.0])
     burst = emitters.Emitter(
         particles,
@@ -46,14 +46,14 @@ def explosion(particles: int = 400, speed: float = 8.0, g: float = 9.8) -> Probl
         frames=16,
         truths=(
             Truth("every fragment is on a sphere of radius s t that falls freely [m]", off_the_sphere, 0.0, 1e-9),
-            Truth("momentum by mass but for its fall, zero to rounding [m/s]", momentum, 0.0, 1e-12),
+            Truth("total momentum over mass, less that of free fall, is zero to rounding [m/s]", momentum, 0.0, 1e-12),
         ),
     )
 
 
 @scene
 def fountain(rate: float = 200.0, speed: float = 6.0, cone: float = 0.5, restitution: float = 0.4) -> Problem:
-    """A fountain of two hundred drops a second in a cone of half a radian, which bounce on the ground without friction."""
+    """A fountain of two hundred drops per second in a cone of half a radian, bouncing on frictionless ground."""
     g, life = 9.8, 1.6
     jet = emitters.Emitter(
         330, emitters.Point((0.0, 0.0, 0.0)), key=1, rate=rate, life=life, speed=speed, direction=UP, cone=cone
@@ -74,7 +74,7 @@ def fountain(rate: float = 200.0, speed: float = 6.0, cone: float = 0.5, restitu
 
 @scene
 def smoke(rate: float = 150.0, rise: float = 1.2, eddies: float = 0.3) -> Problem:
-    """A plume of smoke that buoyancy lifts against its drag, stirred by turbulence without divergence."""
+    """A plume of smoke that rises by buoyancy against drag, stirred by incompressible turbulence."""
     life = 2.0
     plume = emitters.Emitter(
         320,
@@ -91,7 +91,7 @@ def smoke(rate: float = 150.0, rise: float = 1.2, eddies: float = 0.3) -> Proble
 
 @scene
 def fire(rate: float = 400.0, rise: float = 1.5, eddies: float = 0.3) -> Problem:
-    """A fire: hot gas that rises in a turbulent flow, glows from yellow to dark red, and adds up its light."""
+    """A fire: hot gas that rises in a turbulent flow and glows from yellow to dark red, with additive light."""
     life, brightness = 0.8, (0.15, 0.3, 0.15, 0.0)
     flame = emitters.Emitter(
         330,
@@ -113,15 +113,15 @@ def fire(rate: float = 400.0, rise: float = 1.5, eddies: float = 0.3) -> Problem
         return np.sum(flight.final_scene.emitter.appearance(flight.time[-1]).opacity)
 
     mean = np.mean((np.asarray(brightness[1:]) + np.asarray(brightness[:-1])) / 2)
-    steady = Truth("as much light as is given off in a life [1]", light, rate * life * mean, max(brightness))
+    steady = Truth("the light is rate × life × mean opacity [1]", light, rate * life * mean, max(brightness))
     return Problem(gas, duration=1.6, frames=16, truths=(rises, steady, _build_alive_truth(rate * life)))
 
 
 @scene
 def sparks(rate: float = 250.0, speed: float = 3.0, restitution: float = 0.5, cooling: float = 0.5) -> Problem:
-    """Sparks from a grinding wheel a metre up, which bounce on the floor and cool by Newton's law as they fly."""
+    """Sparks from a grinding wheel at a height of one metre, bouncing on the floor and cooling by Newton's law."""
     g, life, height = 9.8, 1.2, 1.0
-    # the share of the heat that is left, e^(-t/τ), at 33 equal times of a life: straight lines miss it by (Δt/τ)²/8
+    # e^(-t/τ) at 33 equally spaced ages; linear interpolation between them is off by at most (Δt/τ)²/8
     ages = np.linspace(0.0, life, 33)
     heat = np.exp(-ages / cooling)
     wheel = emitters.Emitter(
@@ -169,8 +169,8 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
     air = forces.StokesDrag(mass * g / fall, wind=(wind, 0.0, 0.0))
     flakes = Scene(cloud.unborn(), mass, (forces.Gravity(g), air), (ground,), emitter=cloud)
 
-    def off_the_way(flight):
-        """Flakes are born at their terminal speed, and take m/b to go with the wind."""
+    def path_error(flight):
+        """Flakes are born at their terminal speed, and reach the velocity of the wind with the time constant m/b."""
         age, _ = _read_ages(flight)
         emitter = flight.final_scene.emitter
         start = np.asarray(emitter.births(emitter.slot, emitter.generation).position)
@@ -185,12 +185,7 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
         duration=4.0,
         frames=16,
         truths=(
-            Truth(
-                "falls at its terminal speed, drifts as the wind takes it, lies where it lands [m]",
-                off_the_way,
-                0.0,
-                1e-8,
-            ),
+            Truth("falls at its terminal speed, drifts with the wind, stays where it lands [m]", path_error, 0.0, 1e-8),
             _build_alive_truth(rate * life),
         ),
     )
@@ -204,7 +199,7 @@ def _read_ages(flight: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _build_bounce_truths(g: float, restitution: float, height: float = 0.0) -> tuple[Truth, Truth]:
-    """What is thrown from a height [m] and bounces without friction goes on over the ground; upwards it flies twice."""
+    """Thrown from a height [m], particles move uniformly over frictionless ground, and vertically in bounces."""
 
     def seen(flight):
         age, velocity = _read_ages(flight)
@@ -245,15 +240,15 @@ def _build_hot_gas(
         flow = np.asarray(stirring.flow(flight.time[-1], jnp.asarray(flight.position[-1])))
         return np.mean((np.asarray(flight.velocity[-1]) - flow)[age > 10 * lag, 1])
 
-    # it lags behind eddies that it meets as it rises, by τ Du/Dt, which is of both signs
-    rises = Truth("through the air it rises at its terminal speed [m/s]", rising, rise, 0.02 * rise)
+    # smoke lags behind the eddies that it rises through by τ Du/Dt, which averages out over particles
+    rises = Truth("rises relative to the air at its terminal speed [m/s]", rising, rise, 0.02 * rise)
     return Scene(emitter.unborn(), mass, loads, emitter=emitter), rises
 
 
 def _build_alive_truth(expected: float) -> Truth:
-    """In the steady state the number alive is rate times life."""
+    """In the steady state the number of particles alive is rate times life."""
 
     def count(flight):
         return np.sum(flight.final_scene.emitter.alive(flight.time[-1]))
 
-    return Truth("as many are alive as are born in a life", count, expected, 1.0)
+    return Truth("the number alive is rate times life", count, expected, 1.0)

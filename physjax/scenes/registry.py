@@ -1,22 +1,25 @@
-"""The registry of scenes: a scene enters it by its decorator, wherever in this folder it stands."""
+"""The registry of scenes and failures, filled by their decorators from any file of this folder."""
 
+import inspect
 from collections.abc import Callable
 from importlib import resources
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from physjax.study.problem import Problem
 
+if TYPE_CHECKING:
+    from physjax.scenes.failures import Failure  # which imports this file
+
 SCENES: dict[str, Callable[..., Problem]] = {}
-"""Every scene by name: a function that builds its `Problem`, in the float type of the moment (`jax.enable_x64`)."""
-
-
-FAILURES: dict[str, Callable] = {}
+"""Every scene by name: a function that builds its `Problem`, in float64 under `jax.enable_x64`, else in float32."""
+FAILURES: dict[str, Callable[..., "Failure"]] = {}
 """Every run that must fail, by name: a function that builds its `Failure`."""
 
 
 def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
-    """Enter a function that builds a problem in the gallery, under its own name; the first line of its docstring describes it.
+    """Register a function that builds a problem under its own name; the first line of its docstring is its title.
 
     Example:
         >>> @scenes.scene
@@ -29,36 +32,36 @@ def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
     return build
 
 
-def failure(build: Callable) -> Callable:
-    """Enter a function that builds a failure, in the same way.
+def failure(build: Callable[..., "Failure"]) -> Callable[..., "Failure"]:
+    """Register a function that builds a failure, in the same way.
 
     Example:
         >>> @scenes.failure
-        ... def lost():
-        ...     '''A ball that is lost.'''
-        >>> scenes.title("lost"), scenes.FAILURES.pop("lost") is lost
-        ('A ball that is lost.', True)
+        ... def blow_up():
+        ...     '''A ball that becomes NaN.'''
+        >>> scenes.title("blow_up"), scenes.FAILURES.pop("blow_up") is blow_up
+        ('A ball that becomes NaN.', True)
     """
     FAILURES[build.__name__] = build
     return build
 
 
 def title(name: str) -> str:
-    """One line about a scene or a failure.
+    """The title of a scene or a failure: the first line of its docstring.
 
     Example:
         >>> scenes.title("projectile")
         'A ball thrown in a vacuum: the parabola that every second-order method follows exactly.'
     """
-    return (SCENES | FAILURES)[name].__doc__.strip().splitlines()[0]
+    return (inspect.getdoc((SCENES | FAILURES)[name]) or "").partition("\n")[0]
 
 
 def read_table(file: str) -> dict[str, np.ndarray]:
-    """A CSV file of measurements that is shipped with the package, column by column."""
+    """A CSV file of measured data that is part of the package, as arrays by column."""
     path = resources.files("physjax.scenes") / "data" / file
     with path.open(encoding="utf-8") as lines:
         rows = np.genfromtxt(lines, delimiter=",", names=True, dtype=None, encoding="utf-8")
-    return {name: rows[name] for name in rows.dtype.names}
+    return {name: rows[name] for name in rows.dtype.names or ()}
 
 
 __all__ = ["FAILURES", "SCENES", "failure", "read_table", "scene", "title"]

@@ -1,4 +1,4 @@
-"""Things that turn: tops, a handle that flips, a pendulum with a body."""
+"""Rotating bodies: tops, a handle that flips, a physical pendulum."""
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +19,9 @@ UP, BODY_AXIS = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 @scene
 def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
-    """A disc thrown with a wobble, free of torque: its axis goes round the angular momentum, and ω round its axis.
+    """A disc thrown with a wobble, free of torque: its axis precesses about the angular momentum, and ω about its axis.
 
-    Seen from the world the axis goes round at |L|/I₁, seen from the disc ω does at (I₃ - I₁)ω₃/I₁.
+    In the world frame the axis precesses at |L|/I₁, in the body frame ω does at (I₃ - I₁)ω₃/I₁.
     """
     mass, velocity = 0.2, np.array([2.0, 3.0, 0.0])
     disc = inertia.cylinder(mass, radius=0.1, length=0.02)
@@ -47,7 +47,7 @@ def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
         conserved=(ENERGY, ANGULAR_MOMENTUM),
         truths=(
             Truth(
-                "seen from the disc, ω goes round at (I₃ - I₁)ω₃/I₁ [relative]",
+                "in the body frame ω precesses at (I₃ - I₁)ω₃/I₁ [relative]",
                 lambda flight: _turn_rate(_body_angular_velocity(flight)[..., :2], flight.time) / slip,
                 1.0,
                 1e-8,
@@ -59,9 +59,9 @@ def free_top(spin: float = 8.0, wobble: float = 1.5) -> Problem:
 
 @scene
 def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: float = 9.8) -> Problem:
-    """Two tops that lean on their tips and go round at a steady pace, slow and fast: the two roots for one spin.
+    """Two tilted tops in steady precession about their tips, slow and fast: the two roots for one spin.
 
-    Ω = [I₃ω₃ ± √(I₃²ω₃² - 4I₁mgl cosθ)]/(2I₁cosθ), I₁ about the tip; there is no nutation at exactly these.
+    Ω = [I₃ω₃ ± √(I₃²ω₃² - 4I₁mgl cosθ)]/(2I₁cosθ), I₁ about the tip; at exactly these rates there is no nutation.
     """
     mass = 0.2
     top = inertia.cylinder(mass, radius=0.06, length=0.02).about((0.0, 0.0, -length))
@@ -94,12 +94,9 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
         conserved=(ENERGY,),
         truths=(
             Truth(
-                "goes round at Ω of the steady precession [relative]",
-                lambda flight: _turn_rate(_body_axis(flight)[..., [2, 0]], flight.time) / pace,
-                1.0,
-                1e-7,
+                "precesses at Ω [relative]", lambda f: _turn_rate(_body_axis(f)[..., [2, 0]], f.time) / pace, 1.0, 1e-7
             ),
-            Truth("leans as it did [1]", lambda flight: _body_axis(flight)[..., 1], np.cos(tilt), 1e-7),
+            Truth("keeps its tilt [1]", lambda flight: _body_axis(flight)[..., 1], np.cos(tilt), 1e-7),
         ),
         frames=256,
     )
@@ -107,9 +104,9 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
 
 @scene
 def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
-    """A T-shaped handle spun about its axis of intermediate moment, in space: it turns over, and back, for ever.
+    """A T-shaped handle spun about its axis of intermediate moment of inertia: it flips over and back for ever.
 
-    Its angular velocity seen from itself has the period 4K(k)/√((I₃ - I₂)(L² - 2EI₁)/(I₁I₂I₃)), I₁ < I₂ < I₃ and k² =
+    Its angular velocity in the body frame has the period 4K(k)/√((I₃ - I₂)(L² - 2EI₁)/(I₁I₂I₃)), I₁ < I₂ < I₃ and k² =
     (I₂ - I₁)(2EI₃ - L²)/((I₃ - I₂)(L² - 2EI₁)), where L² > 2EI₂ (Landau and Lifshitz, Mechanics, section 37).
     """
     bar, grip = inertia.cylinder(0.15, 0.01, 0.2, axis=0), inertia.cylinder(0.1, 0.01, 0.1, axis=1)
@@ -133,13 +130,13 @@ def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
         conserved=(ENERGY, ANGULAR_MOMENTUM),
         truths=(
             Truth(
-                "has turned over after half of the period, and back after all of it [rad/s]",
+                "has flipped after half a period, and back after a whole one [rad/s]",
                 lambda flight: _body_angular_velocity(flight)[[32, 64]][:, order[1]],
                 np.array([-spin, spin]),
                 1e-6 * spin,
             ),
             Truth(
-                "keeps |L| [relative]",
+                "conserves |L| [relative]",
                 lambda flight: np.linalg.norm(flight.state.angular_momentum, axis=-1) / size,
                 1.0,
                 1e-12,
@@ -151,7 +148,7 @@ def t_handle(spin: float = 6.0, nudge: float = 0.02) -> Problem:
 
 @scene
 def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.8) -> Problem:
-    """A plank that swings from one end, far out: its period is 4K(sin θ₀/2)√(I/mgl), I about the pivot."""
+    """A plank pivoted at one end, swinging far out: its period is 4K(sin θ₀/2)√(I/mgl), I about the pivot."""
     mass, arm = 1.5, 0.45 * length
     plank = inertia.box(mass, (0.08, length, 0.02)).about((0.0, arm, 0.0))
     swing = np.sqrt(float(plank.principal[2]) / (mass * g * arm))
@@ -165,12 +162,12 @@ def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.
         conserved=(ENERGY,),
         truths=(
             Truth(
-                "is lowest after a quarter of the period and after three [m]",
+                "is lowest after a quarter and after three quarters of the period [m]",
                 lambda flight: flight.position[[16, 48], 0],
                 0.0,
                 1e-6 * arm,
             ),
-            Truth("is back after all of it [m]", lambda flight: flight.position[-1], place, 1e-6 * arm),
+            Truth("is back after a whole period [m]", lambda flight: flight.position[-1], place, 1e-6 * arm),
         ),
         frames=64,
     )
@@ -179,7 +176,7 @@ def physical_pendulum(amplitude: float = 2.0, length: float = 0.6, g: float = 9.
 def complete_elliptic(k: float) -> float:
     """K(k) = ∫₀^(π/2) dφ/√(1 - k² sin² φ), by the arithmetic-geometric mean."""
     a, b = 1.0, np.sqrt(1 - k * k)
-    for _ in range(8):  # digits double each time
+    for _ in range(8):  # the number of correct digits doubles each time
         a, b = (a + b) / 2, np.sqrt(a * b)
     return np.pi / (2 * a)
 
@@ -196,19 +193,19 @@ def _tilt_quaternion(tilt: float) -> list:
 
 
 def _body_axis(flight: Trajectory) -> np.ndarray:
-    """Where the body's z axis points, at every frame."""
+    """Direction of the body's z axis in the world frame, at every frame."""
     q = jnp.asarray(flight.state.orientation)
     return np.asarray(rotate_vector(q, jnp.broadcast_to(jnp.asarray(BODY_AXIS, q.dtype), (*q.shape[:-1], 3))))
 
 
 def _body_angular_velocity(flight: Trajectory) -> np.ndarray:
-    """The angular velocity seen from the body, at every frame [rad/s]."""
+    """The angular velocity in the body frame, at every frame [rad/s]."""
     states = jax.tree.map(jnp.asarray, flight.state)
     omega = jax.vmap(lambda state: rigid.angular_velocity(state, flight.scene.mass))(states)
     return np.asarray(rotate_vector_back(states.orientation, omega))
 
 
 def _turn_rate(plane: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """How fast the angle of vectors of a plane grows [rad/s], frames along the first axis."""
+    """Mean angular velocity of vectors in a plane [rad/s], frames along the first axis."""
     angle = np.unwrap(np.arctan2(plane[..., 1], plane[..., 0]), axis=0)
     return (angle[-1] - angle[0]) / time[-1]

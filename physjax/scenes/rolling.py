@@ -1,4 +1,4 @@
-"""Bodies on the ground: what rolls, what slides and then rolls, what tumbles and lies still."""
+"""Bodies on the ground that roll, slide into rolling, or tumble until they are at rest."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from physjax.trajectory import Trajectory
 def rolling(slope: float = 0.3, radius: float = 0.3, length: float = 0.8, g: float = 9.8) -> Problem:
     """A ball and a cylinder roll down a slope: the ball wins, a = (5/7) g sinθ against (2/3) g sinθ.
 
-    A cylinder touches with the ends of its axis, each with the radius around it; the ball has both in its middle.
+    The contact points of the cylinder are the ends of its axis, each with its radius; those of the ball its centre, twice.
     """
     down, up = _slope_direction(slope), np.array([np.sin(slope), np.cos(slope), 0.0])
     ball, roller = inertia.sphere(2.0, radius), inertia.cylinder(2.0, radius, length)
@@ -54,7 +54,7 @@ def rolling(slope: float = 0.3, radius: float = 0.3, length: float = 0.8, g: flo
 
 @scene
 def bowling(speed: float = 6.0, friction: float = 0.12, radius: float = 0.108, g: float = 9.8) -> Problem:
-    """A bowling ball that is thrown without spin slides, then rolls for good at (5/7) v₀, after 2v₀/(7μg)."""
+    """A bowling ball thrown without spin slides for 2v₀/(7μg), then rolls at (5/7) v₀."""
     ball = inertia.sphere(6.0, radius)
     alley = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), coulomb=contacts.Coulomb(friction, friction))
     start = rigid.bodies(ball, (0.0, radius, 0.0), velocity=(speed, 0.0, 0.0))
@@ -69,10 +69,8 @@ def bowling(speed: float = 6.0, friction: float = 0.12, radius: float = 0.108, g
         looks=solids.sphere(radius),
         truths=(
             Truth("rolls at (5/7) v₀ [relative]", lambda f: _velocity(f)[-1, 0] / speed, 5 / 7, 1e-6),
-            Truth("turns as it rolls, ωr/v₀ [1]", lambda f: -_omega(f)[-1, 2] * radius / speed, 5 / 7, 1e-6),
-            Truth(
-                "has come as far as v₀t - μgt²/2, then 5/7 v₀t [relative]", lambda f: f.position[-1, 0] / way, 1.0, 1e-6
-            ),
+            Truth("rolls without slipping, ωr/v₀ [1]", lambda f: -_omega(f)[-1, 2] * radius / speed, 5 / 7, 1e-6),
+            Truth("travels v₀t - μgt²/2, then 5/7 v₀t [relative]", lambda f: f.position[-1, 0] / way, 1.0, 1e-6),
         ),
         frames=32,
     )
@@ -80,7 +78,7 @@ def bowling(speed: float = 6.0, friction: float = 0.12, radius: float = 0.108, g
 
 @scene
 def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
-    """Three boxes dropped with a spin: one that sticks, one that bounces a while, one that bounces for ever."""
+    """Three boxes dropped with a spin: the first sticks, the second bounces a few times, the third bounces for ever."""
     size = np.array([0.4, 0.2, 0.3])
     box = inertia.box(2.0, size)
     rough = np.array([0.6, 0.4, 0.0])
@@ -91,31 +89,27 @@ def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
     start = rigid.bodies(box, place, (0.9, 0.3, 0.2, 0.1), angular_velocity=(1.0, 2.0, 3.0))
     dropped = Scene(start, box, (forces.Gravity(g),), (rigid.SurfaceContact(rigid.ContactPoints.box(size), floor),))
 
-    def lying(flight):
-        """By how much the height of each is off the nearest of the halves of its edges."""
+    def face_error(flight):
+        """By how much the height of each centre differs from the nearest half edge [m]."""
         above = flight.position[-1, :2, 1]
         return np.abs(above[:, None] - size / 2).min(axis=-1)
-
-    def total_energy(flight):
-        states, scene = (jax.tree.map(jnp.asarray, part) for part in (flight.state, flight.scene))
-        return np.asarray(jax.vmap(lambda t, s: energy.total(scene, t, s))(jnp.asarray(flight.time), states))
 
     return Problem(
         dropped,
         duration=4.0,
         looks=solids.box(size),
         truths=(
-            Truth("two come to rest on a face [m]", lying, 0.0, 1e-6),
+            Truth("two come to rest on a face [m]", face_error, 0.0, 1e-6),
             Truth("and do not move [m]", lambda f: f.position[-8:, :2] - f.position[-8, :2], 0.0, 1e-9),
             Truth(
-                "the third keeps its energy [relative]",
-                lambda f: total_energy(f)[:, 2] / total_energy(f)[0, 2],
+                "the third conserves its energy [relative]",
+                lambda f: _total_energy(f)[:, 2] / _total_energy(f)[0, 2],
                 1.0,
                 1e-6,
             ),
             Truth(
-                "no energy is won [relative]",
-                lambda f: np.maximum(total_energy(f) / total_energy(f)[0] - 1, 0.0),
+                "none gains energy [relative]",
+                lambda f: np.maximum(_total_energy(f) / _total_energy(f)[0] - 1, 0.0),
                 0.0,
                 1e-6,
             ),
@@ -124,7 +118,14 @@ def tumbling_box(height: float = 0.5, g: float = 9.8) -> Problem:
     )
 
 
+def _total_energy(flight: Trajectory) -> np.ndarray:
+    """Energy of each body at every frame [J]."""
+    states, scene = (jax.tree.map(jnp.asarray, part) for part in (flight.state, flight.scene))
+    return np.asarray(jax.vmap(lambda t, s: energy.total(scene, t, s))(jnp.asarray(flight.time), states))
+
+
 def _slope_direction(slope: float) -> np.ndarray:
+    """The unit vector down a slope."""
     return np.array([np.cos(slope), -np.sin(slope), 0.0])
 
 

@@ -1,11 +1,11 @@
-"""Snowboards over a jump, in metres: x down the hill, y up. A board is a particle: it does not turn."""
+"""Snowboards over a jump, in metres: x down the hill, y up. A board is a particle without rotation."""
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity
+from physjax.checks import Numbers, quantity
 from physjax.particles import Particles
 from physjax.physics import contacts, forces
 from physjax.scene import Scene
@@ -16,15 +16,15 @@ from physjax.vectors import stack_components
 
 
 class Hill(contacts.Surface):
-    """A slope with a round jump on it, smooth everywhere: h(x) = -s x + b e^(-u²), u = (x - c)/w.
+    """A slope with a smooth jump on it: h(x) = -s x + b e^(-u²), u = (x - c)/w.
 
-    The gap is the height above, times the cosine of the slope: right to first order, and exactly zero on the hill.
+    The signed distance is the height above times the cosine of the slope: right to first order, exactly zero on the hill.
     """
 
-    steepness: Float[Array, "..."] = quantity("steepness s of the slope", "1")
-    jump: Float[Array, "..."] = quantity("height b of the jump", "m")
-    at: Float[Array, "..."] = quantity("middle c of the jump", "m")
-    width: Float[Array, "..."] = quantity("width w of the jump", "m", above=0)
+    steepness: Numbers = quantity("steepness s of the slope", "1")
+    jump: Numbers = quantity("height b of the jump", "m")
+    at: Numbers = quantity("middle c of the jump", "m")
+    width: Numbers = quantity("width w of the jump", "m", above=0)
 
     def height(self, x: Array) -> tuple[Array, Array, Array]:
         """h [m], h' [1] and h'' [1/m]."""
@@ -54,8 +54,8 @@ class Hill(contacts.Surface):
 def snowboard(steepness: float = 0.4, jump: float = 1.5, g: float = 9.8) -> Problem:
     """Three snowboards slide down a smooth hill and over a jump: the faster, the farther.
 
-    A board takes off where the hill bends away faster than it can fall, -h'' v_x² = g, with the speed that its fall has
-    given, v² = v₀² + 2g(h₀ - h). From there it flies along a parabola, to where that meets the hill again.
+    A board takes off where the hill curves away faster than it can fall, -h'' v_x² = g, with the speed that energy gives,
+    v² = v₀² + 2g(h₀ - h). From there it flies along a parabola until that meets the hill again.
     """
     hill = Hill(steepness, jump, 20.0, 3.0, restitution=0.0)
     speed, x = np.array([2.0, 6.0, 9.0]), jnp.zeros(3)
@@ -64,26 +64,26 @@ def snowboard(steepness: float = 0.4, jump: float = 1.5, g: float = 9.8) -> Prob
     start = Particles(jnp.stack([x, top], axis=-1), np.outer(speed, along))
     place, pace, lands = _solve_flights(hill, np.asarray(top) + speed**2 / (2 * g), g)
 
-    def flown(flight):
-        """Seconds since each took off, at every frame, and whether it is in the air."""
+    def flight_time(flight):
+        """Time since each took off [s], at every frame, and whether it is in the air."""
         x = flight.position[..., 0]
         return (x - place[0]) / pace[0], (x > place[0]) & (x < lands)
 
-    def off(flight):
-        t, flies = flown(flight)
+    def path_error(flight):
+        t, flies = flight_time(flight)
         path = place[1] + pace[1] * t - g * t * t / 2
         return np.where(flies, flight.position[..., 1] - path, 0.0)
 
-    def slower(flight):
-        _, flies = flown(flight)
+    def speed_error(flight):
+        _, flies = flight_time(flight)
         return np.where(flies, flight.velocity[..., 0] / pace[0] - 1, 0.0)
 
     return Problem(
         Scene(start, 70.0, (forces.Gravity(g),), (hill,)),
         duration=4.0,
         truths=(
-            Truth("takes off as fast as its fall has made it [relative]", slower, 0.0, 1e-6),
-            Truth("flies along the parabola from where -h'' v_x² = g [m]", off, 0.0, 1e-5),
+            Truth("takes off with the speed that energy gives [relative]", speed_error, 0.0, 1e-6),
+            Truth("flies along the parabola from where -h'' v_x² = g [m]", path_error, 0.0, 1e-5),
             Truth("lands where that meets the hill [m]", _find_landings, lands, 2e-4),
         ),
         frames=128,
@@ -107,7 +107,7 @@ def _solve_flights(hill: Hill, energy: np.ndarray, g: float) -> tuple[np.ndarray
 
 
 def _find_landings(flight: Trajectory) -> np.ndarray:
-    """Where each came down: from the last frame before, straight on for the time that is left [m]."""
+    """Where each landed [m]: from the last frame before, at constant velocity for the time that is left."""
     since = np.asarray(flight.final_scene.contacts[0].touching_since)
     last, lane = np.searchsorted(flight.time, since) - 1, np.arange(since.size)
     return flight.position[last, lane, 0] + flight.velocity[last, lane, 0] * (since - flight.time[last])

@@ -1,6 +1,6 @@
 """Balls in play, in metres from the player: x towards the goal, y up, z to the right.
 
-A ball is a particle: contacts act on its centre, a radius before what is seen, and its spin stays what it was.
+A ball is a particle: contacts act on its centre, a radius in front of the drawn surface, and its spin is constant.
 """
 
 import jax.numpy as jnp
@@ -18,8 +18,8 @@ from physjax.study.problem import Problem, Truth
 def basketball(angle: float = 0.96, g: float = 9.8) -> Problem:
     """Free throws with backspin at four speeds, off the backboard and down through the ring.
 
-    The board is an infinite plane here, so a truth says that it is met where the real one is, from 2.90 to 3.95 m; the
-    ring is not there at all, and a truth says that the ball passes clear of it.
+    The board is an infinite plane, so a truth checks that it is hit where the real one is, from 2.90 to 3.95 m high; the
+    ring is not modelled, and a truth checks that the ball passes clear of it.
     """
     mass, radius = 0.624, 0.12
     board, ring, rim, clearance = 4.6, 4.6 - 0.375, 3.05, 0.225 - radius
@@ -37,8 +37,8 @@ def basketball(angle: float = 0.96, g: float = 9.8) -> Problem:
         contacts=(contacts.Plane((board - radius, 0.0), (-1.0, 0.0), restitution=0.75),),
     )
 
-    def met(flight):
-        """Height at which the board is met: from the last frame before, straight on."""
+    def board_height(flight):
+        """Height at which the board is hit: from the last frame before, in a straight line."""
         last = np.argmin(flight.velocity[..., 0] > 0, axis=0) - 1
         (x, v), lane = flight.state, np.arange(speed.size)
         x, v = x[last, lane], v[last, lane]
@@ -49,11 +49,11 @@ def basketball(angle: float = 0.96, g: float = 9.8) -> Problem:
         duration=1.2,
         truths=(
             Truth(
-                "flies to the board as diffrax says [m]", lambda f: _path_error(f, f.velocity[..., 0] > 0), 0.0, 1e-9
+                "flies to the board as diffrax has it [m]", lambda f: _path_error(f, f.velocity[..., 0] > 0), 0.0, 1e-9
             ),
-            Truth("meets the board between its edges at 2.90 and 3.95 m [m]", met, 3.425, 0.525),
+            Truth("hits the board between its edges at 2.90 and 3.95 m [m]", board_height, 3.425, 0.525),
             Truth(
-                "falls through the ring and clear of it: its centre less than 10.5 cm from the ring's [m]",
+                "falls through the ring without touching it: centres closer than 10.5 cm [m]",
                 lambda f: _find_crossing(f, 1, rim, -1)[..., 0] - ring,
                 0.0,
                 clearance,
@@ -65,7 +65,7 @@ def basketball(angle: float = 0.96, g: float = 9.8) -> Problem:
 
 @scene
 def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
-    """A football curled around the wall, which would miss the goal by metres if it flew straight, and bounces once."""
+    """A football curled around the wall into the goal, which a straight shot would miss by metres; it bounces once."""
     mass, radius = 0.43, 0.11
     wall, goal, post, bar, edge = 9.15, 22.0, 3.66, 2.44, 1.0
     up, aside = np.radians(10.0), np.radians(16.0)
@@ -92,14 +92,16 @@ def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
         ball,
         duration=1.12,
         truths=(
-            Truth("flies and curves to the ground as diffrax says [m]", lambda f: _path_error(f, flown(f)), 0.0, 1e-9),
             Truth(
-                "passes the wall beside its last player, who stands 1 m from the middle [m]",
+                "flies and curves to the ground as diffrax has it [m]", lambda f: _path_error(f, flown(f)), 0.0, 1e-9
+            ),
+            Truth(
+                "passes next to the last player of the wall, 1 m from its middle [m]",
                 lambda f: np.maximum(edge + radius - _find_crossing(f, 0, wall, +1)[2], 0.0),
                 0.0,
                 0.0,
             ),
-            Truth("was aimed beside the goal [m]", lambda f: np.maximum(post - goal * aim[2] / aim[0], 0.0), 0.0, 0.0),
+            Truth("was aimed next to the goal [m]", lambda f: np.maximum(post - goal * aim[2] / aim[0], 0.0), 0.0, 0.0),
             Truth("goes in between the posts [m]", lambda f: line(f)[2], 0.0, post - radius),
             Truth("goes in under the bar [m]", lambda f: line(f)[1], bar / 2, bar / 2 - radius),
             Truth("bounces once before the line", lambda f: np.sum(bounced(f) & (f.position[1:, 0] < goal)), 1, 0),
@@ -108,14 +110,14 @@ def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
 
 
 def _path_error(flight, before):
-    """Largest distance [m] between a run and diffrax's, which knows no contacts, over the frames before a touch."""
+    """Largest distance [m] from diffrax's solution without contacts, over the frames before the first contact."""
     free = Scene(flight.scene.state, flight.scene.mass, flight.scene.forces)
     path = reference(free, flight.time, rtol=1e-12, atol=1e-12)
     return (np.linalg.norm(flight.position - path.position, axis=-1) * before).max()
 
 
 def _find_crossing(flight, axis, level, way):
-    """Where each lane first passes a level of one coordinate, upward (`way` +1) or downward (-1), straight between frames."""
+    """Where each lane first crosses a level of one coordinate, upward (`way` +1) or downward (-1), by linear interpolation."""
     beyond = way * (flight.position[..., axis] - level)
     first = np.argmax((beyond[:-1] < 0) & (beyond[1:] >= 0), axis=0)[None, ..., None]
     before, after = (np.take_along_axis(x, first, axis=0)[0] for x in (flight.position[:-1], flight.position[1:]))

@@ -1,4 +1,4 @@
-"""Bodies made of springs that fall, carry, break and are blown up: a jelly and a bridge."""
+"""Structures made of springs: a jelly that falls, a bridge that is loaded until it breaks, and one that is blown up."""
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,9 @@ SPAN, HEIGHT, PANELS = 12.0, 2.0, 6
 
 @scene
 def jelly_cube(nodes: int = 4, side: float = 0.2, lean: float = 0.0, g: float = 9.8) -> Problem:
-    """A cube of jelly falls flat on a smooth floor, bounces, and trembles until it lies still.
+    """A cube of jelly falls flat on a smooth floor, bounces, and vibrates until it is at rest.
 
-    With a `lean` [rad] it falls on its edge and turns over, which no chart can follow: on which face it ends hangs on
-    the last digit.
+    With a `lean` [rad] it falls on its edge and turns over; that is chaotic, and no chart can compare methods on it.
     """
     jelly = lattices.jelly(
         (side,) * 3, (nodes,) * 3, mass=1.0, structural=300.0, shear=150.0, damping=0.7, corner=(-side / 2,) * 3
@@ -37,58 +36,41 @@ def jelly_cube(nodes: int = 4, side: float = 0.2, lean: float = 0.0, g: float = 
         forces=(forces.Gravity(g), jelly.springs),
         contacts=(contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0),),
     )
-    touch = np.sqrt(2 * drop / g)
-    share = np.asarray(jelly.mass)
+    return Problem(falling, duration=3.0, looks=jelly, truths=_build_jelly_truths(jelly, side, drop, g), frames=32)
+
+
+def _build_jelly_truths(jelly: lattices.Lattice, side: float, drop: float, g: float) -> tuple[Truth, ...]:
+    impact_time, share = np.sqrt(2 * drop / g), np.asarray(jelly.mass)
 
     def volume(x):
         a, b, c = (x[..., jelly.faces[:, i], :] for i in range(3))
-        return np.sum(a * np.cross(b, c), axis=(-1, -2)) / 6
+        return np.sum(a * np.cross(b, c), axis=(-1, -2)) / 6 / side**3
 
     def height(flight):
         return flight.position[..., 1] @ share
 
     def fall(flight):
         fallen = height(flight)[0] - height(flight)
-        return (fallen - 0.5 * g * flight.time**2)[flight.time < touch]
+        return (fallen - 0.5 * g * flight.time**2)[flight.time < impact_time]
 
     def bounce(flight):
         lowest = np.argmin(height(flight))
         return height(flight)[lowest:].max() - height(flight)[lowest]
 
-    return Problem(
-        falling,
-        duration=3.0,
-        looks=jelly,
-        truths=(
-            Truth("falls as a whole, ½gt², until it touches [m]", fall, 0.0, 1e-12),
-            Truth("bounces: its middle rises again [m]", bounce, 0.1, 0.05),
-            Truth(
-                "is squashed by the floor [part of its volume]",
-                lambda f: 1 - volume(f.position).min() / side**3,
-                0.2,
-                0.19,
-            ),
-            Truth(
-                "has its volume back at the end, but for its own weight [share]",
-                lambda f: volume(f.position[-1]) / side**3,
-                1.0,
-                0.02,
-            ),
-            Truth("no node is under the floor [m]", lambda f: np.minimum(f.position[..., 1], 0.0), 0.0, 1e-12),
-            Truth(
-                "lies still at the end, but for a trembling of at most g dt [g dt]",
-                lambda f: np.abs(f.velocity[-1]) / (g * f.dt),
-                0.0,
-                1.0,
-            ),
-        ),
-        frames=32,
+    speed = lambda flight: np.abs(flight.velocity[-1]) / (g * flight.dt)  # noqa: E731
+    return (
+        Truth("falls as a whole, ½gt², until the impact [m]", fall, 0.0, 1e-12),
+        Truth("bounces: its centre rises again [m]", bounce, 0.1, 0.05),
+        Truth("is compressed by the floor [share of its volume]", lambda f: 1 - volume(f.position).min(), 0.2, 0.19),
+        Truth("regains its volume but for its own weight [share]", lambda f: volume(f.position[-1]), 1.0, 0.02),
+        Truth("no node is under the floor [m]", lambda f: np.minimum(f.position[..., 1], 0.0), 0.0, 1e-12),
+        Truth("vibrates at the end with at most g dt [g dt]", speed, 0.0, 1.0),
     )
 
 
 @scene
 def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) -> Problem:
-    """A bridge under a load that grows by four tonnes a second until a beam parts, the next one follows, and it falls."""
+    """A bridge under a load that grows by four tonnes per second until one beam breaks after the other and it falls."""
     bridge, start = _build_loaded_bridge(breaks_at, g)
     loaded = np.zeros((start.shape[0], 2))
     loaded[np.flatnonzero(bridge.nodes["deck"])[2], 1] = -rate
@@ -98,42 +80,44 @@ def breaking_bridge(rate: float = 4e4, breaks_at: float = 0.03, g: float = 9.8) 
         forces=(forces.Gravity(g), bridge.springs, _GrowingLoad(loaded)),
         pinned=bridge.nodes["supports"],
     )
-    weight = np.asarray(bridge.mass)[:, None] * np.array([0.0, -g])
-    strain = lambda t: _strain(bridge, _solve_equilibrium(bridge, weight + t * loaded))  # noqa: E731
-    low, high = 0.0, 10.0
-    for _ in range(30):
-        t = 0.5 * (low + high)
-        low, high = (t, high) if strain(t).max() < breaks_at else (low, t)
-    weakest = int(np.argmax(strain(low)))
-
+    moment, weakest = _solve_first_break(bridge, loaded, breaks_at, g)
     return Problem(
         breaking,
-        duration=low + 0.75,
+        duration=moment + 0.75,
         truths=(
             Truth(
-                "the first beam parts under the load that statics says [s]",
+                "the first beam breaks under the load of statics [s]",
                 lambda f: f.time[_find_first_break(f)],
-                low,
+                moment,
                 0.05,
             ),
             Truth(
-                "it is the one that is stretched most in statics",
+                "it is the one with the largest strain in statics",
                 lambda f: _mark_broken(f)[_find_first_break(f)][weakest],
                 True,
                 0,
             ),
-            Truth(
-                "what has parted stays parted", lambda f: np.minimum(np.diff(_mark_broken(f), axis=0), 0.0), 0.0, 0.0
-            ),
+            STAYS_BROKEN,
             Truth("the bridge falls: its lowest node at the end [m]", lambda f: f.position[-1, :, 1].min(), -5.0, 4.0),
         ),
         frames=128,
     )
 
 
+def _solve_first_break(bridge: lattices.Lattice, loaded: np.ndarray, breaks_at: float, g: float) -> tuple[float, int]:
+    """When the first beam breaks in statics under a load that grows as `loaded` [N/s], by bisection [s], and which it is."""
+    weight = np.asarray(bridge.mass)[:, None] * np.array([0.0, -g])
+    strain = lambda t: _strain(bridge, _solve_equilibrium(bridge, weight + t * loaded))  # noqa: E731
+    low, high = 0.0, 10.0
+    for _ in range(30):
+        t = 0.5 * (low + high)
+        low, high = (t, high) if strain(t).max() < breaks_at else (low, t)
+    return low, int(np.argmax(strain(low)))
+
+
 @scene
 def blown_bridge(impulse: float = 2e4, breaks_at: float = 0.03, g: float = 9.8) -> Problem:
-    """The same bridge, blown up from below: the beams near the blast part, what is left flies or falls."""
+    """The same bridge, blown up from below: beams near the blast break, and the pieces fly or fall."""
     bridge, start = _build_loaded_bridge(breaks_at, g)
     blast = forces.Blast((0.4 * SPAN, -1.0), impulse, reach=2.0, at=1 / 512, duration=1 / 512)
     blown = Scene(
@@ -148,7 +132,7 @@ def blown_bridge(impulse: float = 2e4, breaks_at: float = 0.03, g: float = 9.8) 
     free = ~bridge.nodes["supports"]
 
     def received(flight):
-        """Momentum gained while the blast lasts, less what springs and weight gave meanwhile (the mean of both ends)."""
+        """Momentum gained while the blast lasts, less the impulse of springs and weight meanwhile (trapezoidal rule)."""
         before, after = (Particles(flight.position[i], flight.velocity[i]) for i in (1, 2))
         others = flight.scene.replace(forces=flight.scene.forces[:2])
         steady = 0.5 * (np.asarray(_evaluate_loads(others, before)) + np.asarray(_evaluate_loads(others, after)))
@@ -160,11 +144,9 @@ def blown_bridge(impulse: float = 2e4, breaks_at: float = 0.03, g: float = 9.8) 
         duration=1.0,
         truths=(
             Truth("each node gets the impulse J/(1 + (d/r)²) [N s]", received, expected[free], 0.005 * impulse),
-            Truth("nothing parts before the blast", lambda f: _mark_broken(f)[1], 0.0, 0.0),
-            Truth("some of the beams part [share of all]", lambda f: _mark_broken(f)[-1].mean(), 0.5, 0.49),
-            Truth(
-                "what has parted stays parted", lambda f: np.minimum(np.diff(_mark_broken(f), axis=0), 0.0), 0.0, 0.0
-            ),
+            Truth("no beam breaks before the blast", lambda f: _mark_broken(f)[1], 0.0, 0.0),
+            Truth("some of the beams break [share of all]", lambda f: _mark_broken(f)[-1].mean(), 0.5, 0.49),
+            STAYS_BROKEN,
         ),
         frames=512,
     )
@@ -174,7 +156,7 @@ _evaluate_loads = jax.jit(lambda scene, state: loads(scene, 0.0, state))
 
 
 class _GrowingLoad(Force):
-    """A load that grows from nothing: F = rate · t."""
+    """A load that grows from zero: F = rate · t, with one rate per node [N/s]."""
 
     rate: jax.Array
 
@@ -186,14 +168,14 @@ class _GrowingLoad(Force):
 
 
 def _build_loaded_bridge(breaks_at, g):
-    """The bridge, and the positions in which it carries its own weight."""
+    """The bridge, and its equilibrium positions under its own weight."""
     bridge = lattices.bridge(SPAN, HEIGHT, PANELS, mass=6000.0, stiffness=2e6, damping=1e4, breaks_at=breaks_at)
     weight = np.asarray(bridge.mass)[:, None] * np.array([0.0, -g])
     return bridge, jnp.asarray(_solve_equilibrium(bridge, weight))
 
 
 def _solve_equilibrium(bridge, load):
-    """Where the nodes stand under a load [N], in NumPy: Newton's method on the forces of the beams."""
+    """Equilibrium positions of the nodes under a load [N], in NumPy: Newton's method on the forces of the beams."""
     x, held = np.asarray(bridge.state.position, float).copy(), np.repeat(bridge.nodes["supports"], 2)
     (a, b), rest = bridge.springs.pairs.T, np.asarray(bridge.springs.rest_length, float)
     k = float(bridge.springs.stiffness)
@@ -224,10 +206,13 @@ def _strain(bridge, x):
 
 
 def _mark_broken(flight):
-    """1 for each beam that has parted, else 0, `(frames, beams)`."""
+    """1 for each broken beam, else 0, `(frames, beams)`."""
     return 1.0 - np.asarray(flight.parts[0].unbroken)
 
 
 def _find_first_break(flight):
-    """The first frame in which a beam has parted."""
+    """The first frame with a broken beam."""
     return int(np.argmax(_mark_broken(flight).any(axis=1)))
+
+
+STAYS_BROKEN = Truth("broken beams stay broken", lambda f: np.minimum(np.diff(_mark_broken(f), axis=0), 0.0), 0.0, 0.0)

@@ -1,1 +1,1 @@
-"""What you look at: plots, films and reports."""
+"""What you look at: plots, films, pages to turn in 3-D, and exports of a run."""

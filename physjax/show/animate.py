@@ -1,35 +1,42 @@
 """Runs as films in real time: cloth, rigid bodies, springs, and particles with a trail behind them.
 
-Every other function returns a `Film`, which shows itself in a notebook and has `.save("name.gif")` and `.save("name.html")`.
-It plays `speed` seconds of the run a second, in `fps` pictures, which are picked by the film's own time. `view` returns
-a page on which the run can be turned as well.
+All functions but `view` return a `Film`, which a notebook shows and which has `.save("name.gif")` and
+`.save("name.html")`. It plays `speed` seconds of the run a second, in `fps` pictures, picked by the time of the frames.
+`view` returns a page on which the run can be turned as well.
 """
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 from jax.typing import ArrayLike
 
 from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.physics.springs.assembly import Lattice
+from physjax.physics.springs.springs import Springs
 from physjax.show.films import Film, schedule
 from physjax.show.frames import get_faces, take_frames, take_lanes
 from physjax.show.panels import build_scenery
 from physjax.show.particles import prepare_particles
-from physjax.show.solids import take_bodies
+from physjax.show.solids import Shape, take_bodies
 from physjax.show.spring_lines import build_spring_lines, draw_springs, draw_strain_bar, take_springs
 from physjax.show.surfaces import draw_surface
 from physjax.show.trails import build_trail_scenery, build_trails
 from physjax.show.view import View, view
 from physjax.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+
+__all__ = ["Film", "View", "bodies", "cloth", "particles", "paths", "springs", "view"]
+
 
 def cloth(
     film: Trajectory,
-    sheet: Any,
+    sheet: Lattice,
     *,
     scene: int | Sequence[int] | None = None,
-    color: Any = "#56B4E9",
+    color: "ColorType" = "#56B4E9",
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
@@ -52,13 +59,13 @@ def cloth(
 
 def bodies(
     film: Trajectory,
-    shapes: Any,
+    shapes: Shape | Sequence[Shape],
     *,
-    color: Any = "#56B4E9",
+    color: "ColorType" = "#56B4E9",
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
-    """Rigid bodies with their real shapes; see `plot.bodies`, and `animate.cloth` for the errors.
+    """Rigid bodies as solids; see `plot.bodies`, and `animate.cloth` for the errors.
 
     Example:
         >>> from physjax.show import solids
@@ -74,7 +81,7 @@ def bodies(
 
 def springs(
     film: Trajectory,
-    sheet: Any,
+    sheet: Lattice | Springs,
     *,
     scene: int | Sequence[int] | None = None,
     limit: int | float | None = None,
@@ -105,10 +112,10 @@ def paths(
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
-    """Particles as dots, with the way of the last `trail` seconds of film behind them, in one, two or three dimensions.
+    """Particles as dots, with their paths of the last `trail` seconds of film behind them, in one, two or three dimensions.
 
-    In one dimension they stand side by side and move up and down. `every` draws one lane in so many, `color` colours
-    lanes by a value each. Lanes that blew up vanish. Raises TypeError or ValueError for what does not fit.
+    In one dimension they stand side by side and move up and down. Of the lanes one in `every` is drawn; `color` colours
+    lanes by a value each. Lanes that blew up disappear. Raises TypeError or ValueError for what does not fit.
 
     Example:
         >>> film = animate.paths(flight, fps=10.0)
@@ -140,9 +147,6 @@ def particles(
     seen, draw, bar = prepare_particles(who, film, density)
     frames, fps = schedule(who, seen, fps, speed)
     return Film(build_scenery(seen, frames), frames, fps, draw, bar=bar)
-
-
-__all__ = ["Film", "View", "bodies", "cloth", "particles", "paths", "springs", "view"]
 
 
 def __dir__() -> list[str]:

@@ -1,54 +1,61 @@
 """Runs for Blender, engines and other programs: animated glTF, and PLY files frame by frame. `Trajectory.save` writes NPZ.
 
-What a film is exported as, `shown`, is as in `animate.view`: a lattice with faces, springs, a `solids` shape or one for
-each body; without it the scene says. Metres; glTF has y up, and a scene with another axis up is turned by its root node,
-PLY has the axes of the scene. In the plane z is 0.
+`shown` says what a run is exported as, as in `animate.view`: a lattice with faces, springs, a `solids` shape or one for
+each body. Without it bodies are boxes of their inertia and nodes are joined by the springs of the scene.
+
+Metres. glTF has y up, and its root node turns a scene with another axis up; PLY has the axes of the scene. In the plane
+z is 0.
 """
 
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from physjax.files import write_atomically, write_folder_atomically
-from physjax.show.drawables import Bodies, Dots, Lines, Surface, choose_drawable
+from physjax.show.drawables import Bodies, Dots, Lines, Look, Surface, choose_drawable
 from physjax.show.films import schedule
 from physjax.show.frames import Frames, find_batch_index, find_intact_springs
-from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document
+from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document, Json
 from physjax.show.pages import check_output_path
 from physjax.text import progress_bar
 from physjax.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+
 __all__ = ["gltf", "ply"]
 
 MAX_MORPH_TARGETS = 240
-"""Frames of what deforms in one glTF file: each is a morph target, and programs slow down or give up beyond a few hundred."""
+"""Frames of a shape that deforms in one glTF file: each is a morph target, and programs fail beyond a few hundred."""
 MAX_MORPH_BYTES = 2**30
-"""Of the arrays in one glTF file; its own limit is four times that."""
+"""Bytes of the arrays in one glTF file; the format's own limit is four times that."""
 DEFAULT_COLOR = "#56B4E9"
+
+T = TypeVar("T")
 
 
 def gltf(
     film: Trajectory,
     path: str | os.PathLike,
-    shown: Any = None,
+    shown: Look | None = None,
     *,
     scene: int | Sequence[int] | None = None,
-    color: Any = DEFAULT_COLOR,
+    color: "ColorType" = DEFAULT_COLOR,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
     progress: bool = True,
 ) -> Path:
     """Write a run as an animated glTF file, .glb, whole or not at all; returns its path.
 
-    Bodies are nodes that move and turn. What deforms (a cloth, springs, dots) has a morph target for each frame, so that
-    it goes straight from one to the next: 12 bytes a node and frame, no normals, at most 240 frames and 1 GiB. It plays
-    `speed` seconds of the run a second, in `fps` frames. `color` is one for all. Numbers are float32.
+    Bodies are nodes that move and turn. A cloth, springs and dots have a morph target for each frame, linear in between:
+    12 bytes a node and frame, no normals, at most 240 frames and 1 GiB. The file plays `speed` seconds of the run a
+    second, in `fps` frames. `color` is one for all. Numbers are float32.
 
     Raises TypeError or ValueError for what does not fit, too many frames among them (choose a lower `fps`, a higher
-    `speed`, or `export.ply`), lanes that blew up, and springs that part, for glTF cannot take a line away.
+    `speed`, or `export.ply`), lanes that blew up, and springs that break, since glTF cannot remove a line.
 
     Example:
         >>> from physjax.show import solids
@@ -64,8 +71,8 @@ def gltf(
         _check_morph_size(who, place)
     if isinstance(seen, Lines) and _any_spring_breaks(who, film, seen, scene, frames):
         raise ValueError(
-            f"{who}: got springs that part, expected ones that hold: glTF cannot take a line away. export.ply writes "
-            "those that hold."
+            f"{who}: got springs that break, expected intact ones: glTF cannot remove a line. export.ply writes "
+            "those that are intact."
         )
     document = Document(seen.run.up if seen.run.dim == 3 else 1)
     times = document.accessor(np.arange(len(frames)) / fps)
@@ -82,7 +89,7 @@ def gltf(
 def ply(
     film: Trajectory,
     folder: str | os.PathLike,
-    shown: Any = None,
+    shown: Look | None = None,
     *,
     scene: int | Sequence[int] | None = None,
     fps: int | float = 30.0,
@@ -91,7 +98,7 @@ def ply(
 ) -> list[Path]:
     """Write a run as binary PLY files, `frame_0000.ply` and on, into a new folder, all or none; returns their paths.
 
-    Surfaces and bodies have faces, springs edges (those that hold), dots are points. Numbers are float32 [m]; lanes that
+    Surfaces and bodies have faces, intact springs are edges, dots are points. Numbers are float32 [m]; lanes that
     blew up are left out, and the time of a frame [s] is in its header. Raises TypeError or ValueError for what does not
     fit, and an OSError for a folder that cannot be made or is not empty.
 
@@ -105,24 +112,19 @@ def ply(
     seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
     seen = seen.surface() if isinstance(seen, Bodies) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
-    held = (
-        find_intact_springs(who, film, seen.springs, find_batch_index(who, film, scene))
-        if isinstance(seen, Lines)
-        else None
-    )
+    held = _find_intact(who, film, seen, scene) if isinstance(seen, Lines) else None
     digits = max(4, len(str(len(frames))))
     names = [f"frame_{number:0{digits}d}.ply" for number in range(len(frames))]
     with write_folder_atomically(folder) as inside:
         for name, frame in _track_progress(list(zip(names, frames, strict=True)), progress):
-            place = _pad_to_three(seen.run.position[frame])
-            (inside / name).write_bytes(
-                _encode_ply(seen, place, None if held is None else held[frame], seen.run.time[frame])
-            )
+            intact = None if held is None else held[frame]
+            code = _encode_ply(seen, _pad_to_three(seen.run.position[frame]), intact, seen.run.time[frame])
+            (inside / name).write_bytes(code)
     return [folder / name for name in names]
 
 
 def _add_bodies(document: Document, seen: Bodies, place: np.ndarray, frames: list[int], times: int, look: int) -> None:
-    """A mesh for each different shape, a node for each body."""
+    """A mesh for each different shape, and a node for each body."""
     turn = np.roll(_align_quaternion_signs(seen.orientation[frames]), -1, axis=-1)
     meshes: dict[bytes, int] = {}
     for body, shape in enumerate(seen.shapes):
@@ -136,22 +138,24 @@ def _add_bodies(document: Document, seen: Bodies, place: np.ndarray, frames: lis
         document.animate(node, "rotation", times, document.accessor(turn[:, body]))
 
 
-def _add_morphing(document: Document, seen: Any, places: Iterable[np.ndarray], times: int, look: int) -> None:
-    """One mesh that goes from frame to frame: the first is its own shape, each of the others a target of weight 0 or 1."""
-    kinds = {Surface: (TRIANGLES, "faces"), Lines: (LINES, "pairs"), Dots: (POINTS, None)}
-    mode, joined = kinds[type(seen)]
+def _add_morphing(
+    document: Document, seen: Surface | Lines | Dots, places: Iterable[np.ndarray], times: int, look: int
+) -> None:
+    """One mesh with the shape of the first frame, and each other frame as a morph target of weight 0 or 1."""
     first, *others = places
-    what = {"attributes": {"POSITION": document.vertices(first)}, "mode": mode, "material": look}
-    if joined is not None:
-        what["indices"] = document.indices(seen.faces if joined == "faces" else seen.springs.pairs)
+    what: Json = {"attributes": {"POSITION": document.vertices(first)}, "mode": POINTS, "material": look}
+    if isinstance(seen, Surface):
+        what |= {"mode": TRIANGLES, "indices": document.indices(seen.faces)}
+    elif isinstance(seen, Lines):
+        what |= {"mode": LINES, "indices": document.indices(seen.springs.pairs)}
     what["targets"] = [{"POSITION": document.vertices(place - first)} for place in others]
     node = document.node(name="run", mesh=document.mesh(what, weights=[0.0] * len(others)))
     weights = np.eye(len(others) + 1)[:, 1:]
     document.animate(node, "weights", times, document.accessor(weights.ravel()))
 
 
-def _encode_ply(seen: Any, place: np.ndarray, held: np.ndarray | None, time: float) -> bytes:
-    """A frame as a file."""
+def _encode_ply(seen: Surface | Lines | Dots, place: np.ndarray, held: np.ndarray | None, time: float) -> bytes:
+    """The bytes of a file with one frame; of springs those that are `held`."""
     vertices = place.astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"comment t = {time:.9g} s"]
     tables = []
@@ -175,46 +179,56 @@ def _require_finite_positions(who: str, run: Frames, frames: list[int]) -> np.nd
     non_finite = ~np.isfinite(place).all(axis=(0, 2))
     if non_finite.any():
         raise ValueError(
-            f"{who}: got {non_finite.sum()} of {non_finite.size} lanes that blew up, first {int(np.argmax(non_finite))}; expected finite "
-            "positions. Leave them out, or write export.ply, which does."
+            f"{who}: got {non_finite.sum()} of {non_finite.size} lanes that blew up, first "
+            f"{int(np.argmax(non_finite))}; expected finite positions. Leave them out, or write export.ply, which does."
         )
     return place
 
 
 def _pad_to_three(position: np.ndarray) -> np.ndarray:
-    """Positions with as many zeros as are missing to three components."""
+    """Positions `(..., dim)` with zeros for the components that are missing to three."""
     return np.pad(position.astype(float), [(0, 0)] * (position.ndim - 1) + [(0, 3 - position.shape[-1])])
 
 
 def _check_morph_size(who: str, place: np.ndarray) -> None:
-    """Raise a ValueError for more frames or bytes than a file of morph targets should have."""
+    """Raise a ValueError for more frames or bytes than a file of morph targets may have."""
     frames, nodes, _ = place.shape
     if frames > MAX_MORPH_TARGETS or 12 * frames * nodes > MAX_MORPH_BYTES:
         raise ValueError(
             f"{who}: got {frames} frames of {nodes} nodes, {12e-6 * frames * nodes:.3g} MB, expected at most {MAX_MORPH_TARGETS} "
-            f"frames and {MAX_MORPH_BYTES / 1e6:.0f} MB of what deforms. Choose a lower fps=, a higher speed=, or export.ply."
+            f"frames and {MAX_MORPH_BYTES / 1e6:.0f} MB of morph targets. Choose a lower fps=, a higher speed=, or export.ply."
         )
 
 
-def _any_spring_breaks(who: str, film: Trajectory, seen: Lines, scene: Any, frames: list[int]) -> bool:
-    held = find_intact_springs(who, film, seen.springs, find_batch_index(who, film, scene))
+def _find_intact(who: str, film: Trajectory, seen: Lines, scene: int | Sequence[int] | None) -> np.ndarray | None:
+    """Which springs are intact at every frame, `(frames, springs)`; None where none can break."""
+    return find_intact_springs(who, film, seen.springs, find_batch_index(who, film, scene))
+
+
+def _any_spring_breaks(
+    who: str, film: Trajectory, seen: Lines, scene: int | Sequence[int] | None, frames: list[int]
+) -> bool:
+    held = _find_intact(who, film, seen, scene)
     return held is not None and not held[frames].all()
 
 
 def _align_quaternion_signs(q: np.ndarray) -> np.ndarray:
-    """Quaternions along the first axis, each with the sign that is nearer to the one before it."""
+    """Quaternions along the first axis, each with the sign that is closer to the one before it.
+
+    q and -q are the same rotation, but between them a player would turn the long way round.
+    """
     turned_back = np.sum(q[1:] * q[:-1], axis=-1) < 0
     sign = np.cumprod(np.where(turned_back, -1.0, 1.0), axis=0)
     return np.concatenate([q[:1], q[1:] * sign[..., None]])
 
 
-def _to_rgb(color: Any) -> tuple[float, float, float]:
+def _to_rgb(color: "ColorType") -> tuple[float, float, float]:
     from matplotlib.colors import to_rgb
 
     return to_rgb(color)
 
 
-def _track_progress(items: Any, progress: bool) -> Any:
+def _track_progress(items: Iterable[T], progress: bool) -> Iterable[T]:
     return progress_bar(items, progress=progress, desc="writing", unit="frame", leave=False)
 
 

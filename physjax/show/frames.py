@@ -1,26 +1,30 @@
-"""What is looked at: the frames of one scene out of a run, checked before anything is drawn."""
+"""The frames of one scene of a run, checked before anything is drawn."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from physjax.parts import Contact
+from physjax.physics.springs.assembly import Lattice
 from physjax.physics.springs.springs import Springs
 from physjax.trajectory import Trajectory
 
 DAY_SECONDS = 86400.0
+MIN_DURATION_SECONDS = 1e-12
+"""A run of a single frame has no duration; its time is then written with all the decimals that a title may have."""
 
 
 class Frames(NamedTuple):
-    """One scene of a run: `time` (frames,) [s], `position` (frames, nodes, dim) [m], how many frames are `good`, the axis `up`.
+    """One scene of a run: `time` `(frames,)` [s], `position` `(frames, nodes, dim)` [m], its contacts, and the axis `up`.
 
-    A frame is good until a node is no longer finite; where lanes are independent, until none is.
+    The first `good_frames` can be drawn: in those all nodes are finite, or, where lanes are independent, at least one.
     """
 
     time: np.ndarray
     position: np.ndarray
     good_frames: int
-    surfaces: tuple
+    surfaces: tuple[Contact, ...]
     up: int = 1
 
     @property
@@ -35,7 +39,7 @@ class Frames(NamedTuple):
 
     def title(self, frame: int) -> str:
         """The time of a frame, with three figures of the whole duration, and where the run ended if it blew up."""
-        span = max(np.ptp(self.time), 1e-12)
+        span = max(np.ptp(self.time), MIN_DURATION_SECONDS)
         unit, size = ("d", DAY_SECONDS) if span > 3 * DAY_SECONDS else ("s", 1.0)
         decimals = int(np.clip(2 - np.floor(np.log10(span / size)), 0, 12))
         end = f"\nblew up after t = {self.time[self.good_frames - 1] / size:.3g} {unit}" if self.blew_up else ""
@@ -44,16 +48,16 @@ class Frames(NamedTuple):
 
 def take_frames(
     who: str,
-    film: Any,
+    film: Trajectory,
     *,
     scene: int | Sequence[int] | None = None,
     nodes: int | None = None,
     dims: tuple[int, ...] = (2, 3),
 ) -> Frames:
-    """The frames of one scene: of a batch of scenes `(frames, *scenes, nodes, dim)` the one numbered `scene`.
+    """The frames of one scene; of a batch `(frames, *scenes, nodes, dim)`, the one with the number `scene`.
 
-    `who` is named in errors. Raises TypeError or ValueError for what is no run, has no positions, is a whole batch,
-    has not so many `nodes`, or another dimension than `dims`.
+    `who` is named in errors. Raises TypeError for what is not a run, and ValueError for a run without positions, a
+    batch of which none is picked, another number of `nodes`, or a dimension that is not among `dims`.
     """
     time, position = _read_frames(who, film)
     for number in find_batch_index(who, film, scene):
@@ -65,21 +69,23 @@ def take_frames(
             f"{who}: got a film of {position.shape[1]} nodes and a sheet of {nodes}, expected the same number. "
             "Give the lattice the film's scene was made from."
         )
-    whole = np.isfinite(position).all(axis=-1).all(axis=-1)
+    whole = np.asarray(np.isfinite(position).all(axis=(-2, -1)))
     return _build_frames(who, film, time, position, whole, dims)
 
 
-def take_lanes(who: str, film: Any, dims: tuple[int, ...] = (1, 2, 3)) -> Frames:
+def take_lanes(who: str, film: Trajectory, dims: tuple[int, ...] = (1, 2, 3)) -> Frames:
     """The frames of a run with all its lanes side by side, `(frames, lanes, dim)`."""
     time, position = _read_frames(who, film)
     position = position.reshape(len(position), -1, position.shape[-1])
-    some = np.isfinite(position).all(axis=-1)
+    some = np.asarray(np.isfinite(position).all(axis=-1))
     coupled = film.scene is not None and film.scene.couples and np.ndim(film.ok) == 0
-    return _build_frames(who, film, time, position, some.all(axis=-1) if coupled else some.any(axis=-1), dims)
+    return _build_frames(
+        who, film, time, position, np.asarray(some.all(axis=-1) if coupled else some.any(axis=-1)), dims
+    )
 
 
 def find_batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | None) -> tuple[int, ...]:
-    """The axes of scenes that come before the nodes, and which one is meant."""
+    """The number of the chosen scene along each axis of a batch; empty for a single scene."""
     scenes = film.position.shape[1:-2]
     index = () if scene is None else tuple(np.atleast_1d(scene).tolist())
     if len(index) != len(scenes):
@@ -94,7 +100,7 @@ def find_batch_index(who: str, film: Trajectory, scene: int | Sequence[int] | No
 
 
 def pick_frames(who: str, run: Frames, frames: int | Iterable[int] | None, default: int = 3) -> list[int]:
-    """The numbers of the chosen frames, counted from the front; by default so many, evenly over the good ones."""
+    """The numbers of the chosen frames, counted from the front; by default `default` of them, evenly over the good ones."""
     if frames is None:
         return sorted(set(np.linspace(0, run.good_frames - 1, default).round().astype(int).tolist()))
     asked = [frames] if isinstance(frames, int | np.integer) else list(frames)
@@ -117,9 +123,9 @@ def pick_frames(who: str, run: Frames, frames: int | Iterable[int] | None, defau
     return [int(frame) % count for frame in asked]
 
 
-def get_springs(who: str, given: Any) -> Springs:
+def get_springs(who: str, given: object) -> Springs:
     """The springs of a lattice, or those given themselves; a TypeError for anything else."""
-    springs = getattr(given, "springs", given)
+    springs = given.springs if isinstance(given, Lattice) else given
     if not isinstance(springs, Springs):
         raise TypeError(
             f"{who}: got {type(given).__name__}, expected springs.Springs or a lattice that has them, such as "
@@ -129,7 +135,7 @@ def get_springs(who: str, given: Any) -> Springs:
 
 
 def find_intact_springs(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...]) -> np.ndarray | None:
-    """Which springs hold at every frame, `(frames, springs)`, as the film remembers; None where none can break."""
+    """Which springs are intact at every frame, `(frames, springs)`, as the run recorded; None where none can break."""
     if springs.breaks_at is None:
         return None
     for part in film.parts:
@@ -137,27 +143,26 @@ def find_intact_springs(who: str, film: Trajectory, springs: Springs, index: tup
             held = np.asarray(part.unbroken)
             return held[(slice(None), *index[: held.ndim - 2])]
     raise ValueError(
-        f"{who}: got a film that does not remember which of these springs broke, expected one of a scene with them "
+        f"{who}: got a film without a record of which of these springs broke, expected one of a scene with them "
         "among its forces. If it was loaded from a file, load it with scene=."
     )
 
 
-def get_faces(who: str, sheet: Any) -> tuple[np.ndarray, int | None]:
+def get_faces(who: str, sheet: Lattice) -> tuple[np.ndarray, int]:
     """Triangles `(faces, 3)` of a lattice and its number of nodes; TypeError or ValueError if it has no faces."""
-    faces = getattr(sheet, "faces", None)
-    if faces is None:
+    if not isinstance(sheet, Lattice):
         raise TypeError(
             f"{who}: got {type(sheet).__name__}, expected a lattice with faces: from lattices.cloth, jelly or from_mesh."
         )
-    if len(faces) == 0:
+    if len(sheet.faces) == 0:
         raise ValueError(
             f"{who}: got a lattice without faces, expected a cloth, a jelly or a mesh. plot.springs and animate.springs "
             "draw ropes and bridges."
         )
-    return np.asarray(faces), sheet.state.position.shape[-2]
+    return np.asarray(sheet.faces), sheet.state.position.shape[-2]
 
 
-def _read_frames(who: str, film: Any) -> tuple[np.ndarray, np.ndarray]:
+def _read_frames(who: str, film: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Times and positions of a run, one time for all lanes."""
     if not isinstance(film, Trajectory):
         raise TypeError(f"{who}: got {type(film).__name__}, expected a film: the Trajectory that simulate returns.")
@@ -179,7 +184,10 @@ def _read_frames(who: str, film: Any) -> tuple[np.ndarray, np.ndarray]:
     return time, position
 
 
-def _build_frames(who, film, time, position, whole, dims) -> Frames:
+def _build_frames(
+    who: str, film: Trajectory, time: np.ndarray, position: np.ndarray, whole: np.ndarray, dims: tuple[int, ...]
+) -> Frames:
+    """The record of checked frames; `whole` says which of them can be drawn."""
     dim = position.shape[-1]
     if dim not in dims:
         known = " or ".join(map(str, dims))
@@ -194,7 +202,7 @@ def _build_frames(who, film, time, position, whole, dims) -> Frames:
 
 
 def find_up_axis(film: Trajectory) -> int:
-    """The axis that is up in a run: its scene's; y where it does not know its scene."""
+    """The axis that is up in the scene of a run; y (or x on a line) in a run without its scene."""
     return min(1, film.position.shape[-1] - 1) if film.scene is None else film.scene.up
 
 

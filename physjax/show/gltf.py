@@ -1,16 +1,19 @@
-"""A glTF 2.0 file in one piece (.glb): arrays in one binary chunk, and the JSON that says what they are.
+"""A glTF 2.0 file in one piece (.glb): arrays in one binary chunk, and the JSON that describes them.
 
 Metres, seconds and y up; quaternions are (x, y, z, w). Source: the Khronos glTF 2.0 specification.
 """
 
 import json
 import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+Json = dict[str, Any]
+"""A JSON object."""
 POINTS, LINES, TRIANGLES = 0, 1, 4
-"""What a primitive is made of."""
+"""What a primitive is made of, as glTF numbers it."""
 _FLOAT, _UINT = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _UPRIGHT_ROTATIONS = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
@@ -26,17 +29,17 @@ class Document:
 
     def __init__(self, up: int = 1) -> None:
         self._up = up
-        self._json: dict[str, Any] = {
+        self._json: Json = {
             "asset": {"version": "2.0", "generator": "physjax"},
             "scene": 0,
             "scenes": [{"nodes": []}],
         }
         self._chunks: list[bytes] = []
-        self._channels: list[dict[str, Any]] = []
-        self._samplers: list[dict[str, Any]] = []
+        self._channels: list[Json] = []
+        self._samplers: list[Json] = []
 
-    def accessor(self, array: Any, target: int | None = None) -> int:
-        """Enter an array of numbers, vectors or quaternions, as float32, or as uint32 where it is whole; its index."""
+    def accessor(self, array: np.ndarray, target: int | None = None) -> int:
+        """Add an array of numbers, vectors or quaternions as float32, whole numbers as uint32; returns its index."""
         array = np.asarray(array)
         whole = np.issubdtype(array.dtype, np.integer)
         array = np.ascontiguousarray(array, "<u4" if whole else "<f4")
@@ -52,33 +55,33 @@ class Document:
         where = self._append("bufferViews", view if target is None else view | {"target": target})
         return self._append("accessors", {"bufferView": where} | entry | span)
 
-    def vertices(self, array: Any) -> int:
-        """Enter what each vertex has."""
+    def vertices(self, array: np.ndarray) -> int:
+        """Add an array with a row for each vertex; returns its index."""
         return self.accessor(array, _VERTICES)
 
-    def indices(self, array: Any) -> int:
-        """Enter the vertices that make triangles or lines."""
+    def indices(self, array: np.ndarray) -> int:
+        """Add the numbers of the vertices that make triangles or lines; returns the index of the array."""
         return self.accessor(np.asarray(array).ravel(), _INDICES)
 
-    def material(self, color: Any) -> int:
-        """A dull material that is seen from both sides; its colour is sRGB, glTF's is linear."""
+    def material(self, color: Sequence[float]) -> int:
+        """Add a dull material that is seen from both sides, of an sRGB colour (glTF's own are linear); returns its index."""
         rgb = np.asarray(color, float)
         linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
         look = {"baseColorFactor": [*linear.tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
         return self._append("materials", {"pbrMetallicRoughness": look, "doubleSided": True})
 
-    def mesh(self, primitive: dict[str, Any], **more: Any) -> int:
-        """A mesh of one primitive."""
+    def mesh(self, primitive: Json, **more: object) -> int:
+        """Add a mesh of one primitive; returns its index."""
         return self._append("meshes", {"primitives": [primitive]} | more)
 
-    def node(self, **what: Any) -> int:
-        """A node of the scene."""
+    def node(self, **what: object) -> int:
+        """Add a node to the scene; returns its index."""
         node = self._append("nodes", what)
         self._json["scenes"][0]["nodes"].append(node)
         return node
 
     def animate(self, node: int, path: str, times: int, values: int) -> None:
-        """Let a node's translation, rotation or weights go through values at times, straight from one to the next."""
+        """Animate the translation, rotation or weights of a node through values at times, linear in between."""
         self._samplers.append({"input": times, "output": values, "interpolation": "LINEAR"})
         target = {"node": node, "path": path}
         self._channels.append({"sampler": len(self._samplers) - 1, "target": target})
@@ -97,7 +100,7 @@ class Document:
         if self._channels:
             content["animations"] = [{"name": "run", "channels": self._channels, "samplers": self._samplers}]
         text = json.dumps(content, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % 4)
+        text += b" " * (-len(text) % 4)  # chunks begin at multiples of four bytes
         size = 12 + 8 + len(text) + 8 + len(binary)
         header = struct.pack("<4sII", b"glTF", 2, size)
         return (
@@ -108,7 +111,7 @@ class Document:
             + binary
         )
 
-    def _append(self, kind: str, entry: dict[str, Any]) -> int:
+    def _append(self, kind: str, entry: Json) -> int:
         entries = self._json.setdefault(kind, [])
         entries.append(entry)
         return len(entries) - 1

@@ -1,38 +1,48 @@
-"""Pictures of many particles at once: light that adds up, and how many there are in a place."""
+"""Images of many particles at once: light that adds up, and how many particles there are in a place."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+
+from physjax.show.stage import get_space_axes
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
 
 CELL_POINTS = 2.0
 """Width of a cell in which particles are counted [points]."""
 NIGHT_COLOUR = (0.06, 0.06, 0.09)
-"""What glows is seen against this colour."""
+"""The background of particles that glow."""
 SIZE_GROUPS = 5
-"""Particles that glow are spread over the picture in so many groups of about one size."""
+"""Particles that glow are blurred in this many groups of about one size: a blur has one width for all that is in it."""
+MIN_SPREAD_PIXELS = 0.6
+"""The standard deviation of the smallest light [pixels]: a narrower one would flicker as it moves between pixels."""
 
 
-def project_to_pixels(ax: Any, position: np.ndarray) -> np.ndarray:
+def project_to_pixels(ax: "Axes", position: np.ndarray) -> np.ndarray:
     """Where points are in axes that have been laid out [pixels], from the lower left corner of the axes."""
     ax.apply_aspect()
     if position.shape[-1] == 3:
         from mpl_toolkits.mplot3d import proj3d
 
-        position = np.stack(proj3d.proj_transform(*position.T, ax.get_proj())[:2], axis=-1)
+        x, y, z = position.T
+        position = np.stack(proj3d.proj_transform(x, y, z, cast("Axes3D", ax).get_proj())[:2], axis=-1)
     return ax.transData.transform(position) - (ax.bbox.x0, ax.bbox.y0)
 
 
-def count_cells(ax: Any, cell: float = 1.0) -> tuple[int, int]:
+def count_cells(ax: "Axes", cell: float = 1.0) -> tuple[int, int]:
     """Rows and columns of the cells [pixels] that cover axes."""
     return int(np.ceil(ax.bbox.height / cell)), int(np.ceil(ax.bbox.width / cell))
 
 
-def darken_background(ax: Any, flat: bool) -> None:
-    """Darken the background of axes."""
+def darken_background(ax: "Axes", flat: bool) -> None:
+    """Darken the background of axes, in the plane (`flat`) or in space."""
     if flat:
         ax.set_facecolor(NIGHT_COLOUR)
         return
-    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+    for axis in get_space_axes(cast("Axes3D", ax)):
         axis.set_pane_color((*NIGHT_COLOUR, 1.0))
         axis._axinfo["grid"].update(color="0.3", linewidth=0.5)
 
@@ -43,7 +53,7 @@ def render_glow(points: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: 
     `light` is `(particles, 3)`, red, green and blue at the middle of a particle; what is brighter than 1 is seen as 1.
     """
     total = np.zeros((*shape, 3))
-    spread = np.maximum(wide / 4, 0.6)  # two standard deviations are its radius
+    spread = np.maximum(wide / 4, MIN_SPREAD_PIXELS)  # two standard deviations are its radius
     for group in np.array_split(np.argsort(spread), min(SIZE_GROUPS, max(len(spread), 1))):
         if not len(group):
             continue
@@ -58,15 +68,17 @@ def render_glow(points: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: 
     return np.concatenate([colour, cover[..., None]], axis=-1)
 
 
-def count_points(points: np.ndarray, shape: tuple[int, int], cell: float, weights: Any = None) -> np.ndarray:
+def count_points(
+    points: np.ndarray, shape: tuple[int, int], cell: float, weights: np.ndarray | None = None
+) -> np.ndarray:
     """How many points are in each cell of a picture of `shape` (rows from below, columns), or the sum of their weights."""
     edges = [np.arange(n + 1) * cell for n in shape]
     return np.histogram2d(points[:, 1], points[:, 0], bins=edges, weights=weights)[0]
 
 
 def _blur(picture: np.ndarray, sigma: float) -> np.ndarray:
-    """The picture under a bell curve of area 1, by its Fourier transform, with a margin against what comes round."""
-    margin = int(np.ceil(4 * sigma))
+    """The picture under a bell curve of area 1, by its Fourier transform."""
+    margin = int(np.ceil(4 * sigma))  # the transform is periodic: light would come back in at the opposite edge
     padded = np.pad(picture, margin)
     rows, columns = np.fft.fftfreq(padded.shape[0]), np.fft.rfftfreq(padded.shape[1])
     damping = np.exp(-2 * (np.pi * sigma) ** 2 * (rows[:, None] ** 2 + columns**2))
@@ -74,7 +86,7 @@ def _blur(picture: np.ndarray, sigma: float) -> np.ndarray:
     return np.maximum(blurred[margin : margin + picture.shape[0], margin : margin + picture.shape[1]], 0.0)
 
 
-def draw_image(ax: Any, pixels: np.ndarray, **options: Any) -> Any:
+def draw_image(ax: "Axes", pixels: np.ndarray, **options: Any) -> "Artist":
     """Lay an image over all of some axes, its first row below; returns the artist."""
     from matplotlib.image import BboxImage
 

@@ -1,11 +1,11 @@
-"""Pages of their own, put together from what the package ships in web/: they fetch nothing, and play in any browser."""
+"""HTML pages made from the templates that the package ships in web/: they fetch nothing, and play in any browser."""
 
 import html
 import os
+from collections.abc import Iterable
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from physjax.files import write_atomically
 
@@ -16,8 +16,8 @@ def read_web_file(name: str) -> str:
     return (resources.files("physjax.show") / "web" / name).read_text(encoding="utf-8")
 
 
-def fill_page(name: str, **parts: Any) -> str:
-    """A page of web/ with its buttons, and each `__PART__` in its place."""
+def fill_page(name: str, **parts: object) -> str:
+    """A template of web/ with the buttons of tools.html, and each `__PART__` replaced by its content."""
     page = read_web_file(name).replace("__TOOLS__", read_web_file("tools.html"))
     for part, content in parts.items():
         page = page.replace(f"__{part}__", str(content))
@@ -25,12 +25,12 @@ def fill_page(name: str, **parts: Any) -> str:
 
 
 def embed_page(page: str, height: int) -> str:
-    """A page inside a notebook, so many pixels high."""
+    """A page inside a notebook, `height` pixels high."""
     style = f"width:100%;height:{height}px;border:0"
     return f'<iframe srcdoc="{html.escape(page)}" style="{style}" allowfullscreen></iframe>'
 
 
-def check_output_path(path: str | os.PathLike, endings: Any) -> Path:
+def check_output_path(path: str | os.PathLike, endings: Iterable[str]) -> Path:
     """The path, if its name has one of the endings and its folder is there; ValueError or FileNotFoundError otherwise."""
     path = Path(path)
     if path.suffix.lower() not in endings:

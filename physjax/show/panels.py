@@ -1,32 +1,46 @@
-"""Chosen frames side by side, each in axes of its own with the same limits."""
+"""Chosen frames side by side, each in its own axes with the same limits."""
 
 import math
 from collections.abc import Callable, Sequence
 from itertools import product
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
+from physjax.parts import Contact
 from physjax.show import obstacles
 from physjax.show.frames import Frames
 from physjax.show.stage import Stage, build_stage, create_axes
 
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
+    from mpl_toolkits.mplot3d import Axes3D
+
 FIGURE_WIDTH_INCHES = 7.2
-"""A figure is at most so wide [inches], the width of a notebook."""
+"""The largest width of a figure [inches], that of a notebook."""
 TITLE_INCHES = 0.38
 """Room for a line of title [inches]."""
 PANEL_GAP_INCHES = 0.15
 """Between boxes in space that stand side by side [inches]."""
 COLOUR_BAR_INCHES = 0.62
 """Room for a colour bar [inches]."""
+LINE_INCHES = 0.17
+"""Room for each further line of a title [inches]."""
+FIT_PASSES = 3
+"""Times that boxes in space are drawn to fit them: their size on paper is not quite proportional to that of their axes."""
 
 
 class Scenery(NamedTuple):
-    """What stays the same from frame to frame: the film, the box that is shown, and what is in the way."""
+    """What stays the same from frame to frame: the run, the box that is shown, and the surfaces in it."""
 
     run: Frames
     stage: Stage
-    contacts: tuple
+    contacts: tuple[Contact, ...]
 
     @property
     def up(self) -> int:
@@ -42,52 +56,52 @@ class Scenery(NamedTuple):
         """Positions of the nodes [m], `(nodes, dim)`."""
         return self.run.position[frame].astype(float)
 
-    def obstacles(self, ax: Any, frame: int) -> list[Any]:
-        """Draw what is in the way."""
+    def draw_obstacles(self, ax: "Axes", frame: int) -> "list[Artist]":
+        """Draw the surfaces at a frame, behind what moves; in space those that hide nothing."""
         if self.flat:
             return obstacles.draw_flat(ax, self.stage, self.contacts, self.run.time[frame])
-        return obstacles.draw_in_space(ax, self.stage, self.contacts, self.run.time[frame], self.up)
+        return obstacles.draw_in_space(cast("Axes3D", ax), self.stage, self.contacts, self.run.time[frame], self.up)
+
+    def draw_solids(self, ax: "Axes", frame: int) -> "list[Artist]":
+        """Draw the surfaces in space that hide what is behind them; in the plane nothing does."""
+        if self.flat:
+            return []
+        return obstacles.draw_solids(cast("Axes3D", ax), self.stage, self.contacts, self.run.time[frame], self.up)
 
 
-def build_scenery(run: Frames, frames: Any) -> Scenery:
-    """The film and a box that holds the given frames, with what is in the way."""
-    contacts = obstacles.select_shared_surfaces(run.surfaces)
+def build_scenery(run: Frames, frames: Sequence[int]) -> Scenery:
+    """The run and a box that holds the given frames and the surfaces near them."""
+    contacts = obstacles.select_shared_surfaces(run.surfaces, run.dim)
     stage = obstacles.include_obstacles(build_stage(run, frames), contacts, run.time[[min(frames), max(frames)]])
     return Scenery(run, stage.expand(0.03), contacts)
 
 
-def draw_panels(scenery: Scenery, frames: Sequence[int], draw: Callable, figure: Any, bar: Any = None) -> Any:
-    """A figure with a panel for each frame; `draw(ax, scenery, frame)` fills it, `bar(figure, axes)` draws a colour bar."""
+def draw_panels(
+    scenery: Scenery, frames: Sequence[int], draw: Callable, figure: "Figure | None", bar: Callable | None = None
+) -> "Figure":
+    """A figure with a panel for each frame; `draw(ax, scenery, frame)` fills it, `bar(figure, where)` draws a colour bar."""
     from matplotlib import pyplot as plt
 
     figure = figure or plt.figure(figsize=(FIGURE_WIDTH_INCHES, FIGURE_WIDTH_INCHES))
     for ax, frame in zip(arrange_panels(figure, scenery, len(frames), bar), frames, strict=True):
-        scenery.obstacles(ax, frame)
+        scenery.draw_obstacles(ax, frame)
         draw(ax, scenery, frame)
         ax.title.set_text(scenery.run.title(frame))
     return figure
 
 
-def arrange_panels(figure: Any, scenery: Scenery, count: int, bar: Any = None) -> list[Any]:
-    """Empty axes for so many panels; the figure becomes as high as they need."""
+def arrange_panels(figure: "Figure", scenery: Scenery, count: int, bar: Callable | None = None) -> "list[Axes]":
+    """Empty axes for `count` panels; the figure becomes as high as they need."""
     rows, columns = _choose_grid(scenery, count)
     drawn = [create_axes(figure, (rows, columns, place), scenery.stage, scenery.up) for place in range(1, count + 1)]
     lines = 1 + scenery.run.blew_up
     for ax in drawn:
         ax.set_title(scenery.run.title(0), fontsize=10, color="0.2")
-    below, above = COLOUR_BAR_INCHES * (bar is not None), TITLE_INCHES + 0.17 * (lines - 1)
+    below, above = COLOUR_BAR_INCHES * (bar is not None), TITLE_INCHES + LINE_INCHES * (lines - 1)
     if scenery.flat:
-        across, up = scenery.stage.high - scenery.stage.low
-        width = FIGURE_WIDTH_INCHES if columns * across > 0.8 * up else FIGURE_WIDTH_INCHES * 0.7
-        height = float(np.clip(width / columns * up / across, 1.0, 5.0)) + above + 0.35
-        figure.set_size_inches(width, rows * height + below)
-        figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
-        for ax in drawn[:-columns]:
-            ax.set_xlabel("")
-        for place, ax in enumerate(drawn):
-            ax.set_ylabel(ax.get_ylabel() if place % columns == 0 else "")
+        _fit_flat_panels(figure, drawn, scenery.stage, (rows, columns), (above, below))
     else:
-        _fit_boxes(figure, drawn, (rows, columns), (above, below))
+        _fit_boxes(figure, cast("list[Axes3D]", drawn), (rows, columns), (above, below))
     if bar is not None:
         height = figure.get_size_inches()[1]
         bar(
@@ -97,8 +111,26 @@ def arrange_panels(figure: Any, scenery: Scenery, count: int, bar: Any = None) -
     return drawn
 
 
-def draw_colour_bar(figure: Any, where: dict[str, Any], colours: Any, label: str, *, extend: str) -> None:
-    """A colour bar below all panels, where `arrange_panels` has room for it."""
+def _fit_flat_panels(
+    figure: "Figure", drawn: "list[Axes]", stage: Stage, grid: tuple[int, int], margins: tuple[float, float]
+) -> None:
+    """Make the figure as high as panels in the plane need; only those at the left and at the bottom name their axes."""
+    (rows, columns), (above, below) = grid, margins
+    across, up = stage.high - stage.low
+    width = FIGURE_WIDTH_INCHES if columns * across > 0.8 * up else FIGURE_WIDTH_INCHES * 0.7
+    height = float(np.clip(width / columns * up / across, 1.0, 5.0)) + above + 0.35
+    figure.set_size_inches(width, rows * height + below)
+    figure.set_layout_engine("constrained", h_pad=0.08, w_pad=0.08)
+    for ax in drawn[:-columns]:
+        ax.set_xlabel("")
+    for place, ax in enumerate(drawn):
+        ax.set_ylabel(ax.get_ylabel() if place % columns == 0 else "")
+
+
+def draw_colour_bar(
+    figure: "Figure", where: dict[str, Any], colours: "ScalarMappable", label: str, *, extend: str
+) -> None:
+    """A colour bar below all panels, in the room that `arrange_panels` leaves for it."""
     size = {} if "cax" in where else {"shrink": 0.6, "aspect": 40, "pad": 0.04, "location": "bottom"}
     bar = figure.colorbar(colours, orientation="horizontal", extend=extend, **size, **where)
     bar.set_label(label, fontsize=9)
@@ -107,16 +139,17 @@ def draw_colour_bar(figure: Any, where: dict[str, Any], colours: Any, label: str
 
 
 def _choose_grid(scenery: Scenery, count: int) -> tuple[int, int]:
-    """Rows and columns of panels: up to three side by side; in the plane what is wide one above the other, up to three."""
+    """Rows and columns of panels: up to three side by side; wide ones in the plane up to three one above the other."""
     across, up = (scenery.stage.high - scenery.stage.low)[:2] if scenery.flat else (1, 1)
     columns = min(count, math.ceil(count / 3) if across > 1.6 * up else 3)
     return math.ceil(count / columns), columns
 
 
-def _fit_boxes(figure: Any, drawn: list[Any], grid: tuple[int, int], margins: tuple[float, float]) -> None:
-    """Let each box in space fill its cell: axes in space know nothing of how large box and labels become on paper.
+def _fit_boxes(figure: "Figure", drawn: "list[Axes3D]", grid: tuple[int, int], margins: tuple[float, float]) -> None:
+    """Let each box in space fill its cell.
 
-    The first panel of a row has the labels, the others stand close to it.
+    matplotlib does not say how large a box and its labels become on paper, so the first is drawn and measured. Only the
+    first panel of a row has labels; the others stand close to it.
     """
     (rows, columns), (above, below) = grid, margins
     for place, ax in enumerate(drawn):
@@ -124,8 +157,9 @@ def _fit_boxes(figure: Any, drawn: list[Any], grid: tuple[int, int], margins: tu
             _clear_labels(ax)
     width = FIGURE_WIDTH_INCHES if columns > 1 else 5.6
     figure.set_size_inches(width, width)
-    side = width / columns
-    for _ in range(3):
+    side, step, needed = width / columns, 0.0, width
+    box, left, top, bottom = [0.0] * 4, 0.0, 0.0, 0.0
+    for _ in range(FIT_PASSES):
         drawn[0].set_position((0, 0, side / width, side / width))
         figure.draw_without_rendering()
         box = [edge * side for edge in _measure_box(drawn[0])]
@@ -141,29 +175,33 @@ def _fit_boxes(figure: Any, drawn: list[Any], grid: tuple[int, int], margins: tu
         x, y = (width - needed) / 2 - left + column * step, total - above - row * height - top
         ax.set_position((x / width, y / total, side / width, side / total))
         ax.title.set_position((0.5 * (box[0] + box[2]) / side, (top + 0.02) / side))
-        ax._autotitlepos = False
+        ax._autotitlepos = False  # pyright: ignore[reportAttributeAccessIssue] private; or matplotlib would move the title back when it draws
 
 
-def _clear_labels(ax: Any) -> None:
-    """No numbers and names on axes whose neighbour has them."""
-    for name in "xyz":
-        getattr(ax, f"set_{name}label")("")
-        getattr(ax, f"{name}axis").set_tick_params(labelbottom=False, labelleft=False, label1On=False)
+def _clear_labels(ax: "Axes3D") -> None:
+    """Remove the numbers and names of axes whose neighbour has them."""
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.set_label_text("")
+        axis.set_tick_params(labelbottom=False, labelleft=False, label1On=False)
 
 
-def _measure_labelled_box(figure: Any, ax: Any, box: list[float]) -> np.ndarray:
+def _measure_labelled_box(figure: "Figure", ax: "Axes3D", box: list[float]) -> np.ndarray:
     """Left, lower, right and upper end of a box with its labels [inches]."""
-    renderer = figure.canvas.get_renderer()
-    labels = [axis.get_tightbbox(renderer).extents / figure.dpi for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
+    renderer = cast("FigureCanvasAgg", figure.canvas).get_renderer()
+    labels = [
+        np.array(cast("Bbox", axis.get_tightbbox(renderer)).extents) / figure.dpi
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis)
+    ]
     ends = np.array([box, *labels])
     return np.concatenate([ends[:, :2].min(axis=0), ends[:, 2:].max(axis=0)])
 
 
-def _measure_box(ax: Any) -> tuple[float, float, float, float]:
-    """The same ends of the box alone, as shares of the axes."""
+def _measure_box(ax: "Axes3D") -> tuple[float, float, float, float]:
+    """Left, lower, right and upper end of the box alone, as shares of its axes."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
     corners = np.array(list(product(ax.get_xlim(), ax.get_ylim(), ax.get_zlim())))
-    x, y, _ = proj_transform(*corners.T, ax.get_proj())
+    x, y, z = corners.T
+    x, y, _ = proj_transform(x, y, z, ax.get_proj())
     points = ax.transAxes.inverted().transform(ax.transData.transform(np.stack([x, y], axis=-1)))
     return *points.min(axis=0), *points.max(axis=0)

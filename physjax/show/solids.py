@@ -1,21 +1,33 @@
-"""Rigid bodies with their real shapes: triangles that are fixed to each body and turn with it."""
+"""Rigid bodies as solids: triangles that are fixed to each body and turn with it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from physjax.checks import as_real_quantity
 from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.spatial import RigidBodies
 from physjax.show.frames import Frames, pick_frames, take_lanes
 from physjax.show.panels import build_scenery, draw_panels
 from physjax.show.surfaces import draw_surface
 from physjax.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.typing import ColorType
+
+__all__ = ["Shape", "box", "capsule", "cylinder", "sphere"]
+
 CIRCLE_CORNERS = 24
-"""Corners of what is drawn for a circle."""
+"""Corners of the polygon that is drawn for a circle."""
+MIN_EDGE_SHARE = 0.02
+"""The thinnest edge that is drawn of a body without extent in that direction, as a share of its longest."""
+MIN_AREA_SHARE = 1e-12
+"""A triangle with an area below this share of the square of the shape's size has collapsed to a line, as at a pole."""
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _CUBE_FACES = np.array(
     [
@@ -26,23 +38,23 @@ _CUBE_FACES = np.array(
 
 
 class Shape(NamedTuple):
-    """What a body looks like in its own frame, from its centre of mass: vertices [m] `(n, 3)`, triangles `(m, 3)`."""
+    """The surface of a body in its own frame, from its centre of mass: vertices `(n, 3)` [m], triangles `(m, 3)`."""
 
     vertices: np.ndarray
     faces: np.ndarray
 
-    def at(self, place: Any) -> "Shape":
-        """The shape moved by a vector [m] of the body."""
+    def at(self, place: ArrayLike) -> "Shape":
+        """The shape moved by a vector [m] in the frame of the body."""
         return self._replace(vertices=self.vertices + np.asarray(place, float))
 
     def joined(self, *others: "Shape") -> "Shape":
-        """One shape of several."""
+        """This shape and others as one."""
         vertices, faces = zip(self, *others, strict=True)
         starts = np.cumsum([0, *(len(part) for part in vertices[:-1])])
         return Shape(np.concatenate(vertices), np.concatenate([f + s for f, s in zip(faces, starts, strict=True)]))
 
 
-def box(size: Any) -> Shape:
+def box(size: ArrayLike) -> Shape:
     """A box with edges along the axes [m], `(3,)`."""
     return Shape(_CUBE * np.asarray(as_real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
 
@@ -68,16 +80,16 @@ def sphere(radius: float) -> Shape:
 
 def bodies(
     film: Trajectory,
-    shapes: Any,
+    shapes: Shape | Sequence[Shape],
     frames: int | Iterable[int] | None = None,
     *,
-    color: Any = "#56B4E9",
-    figure: Any = None,
-) -> Any:
+    color: "ColorType" = "#56B4E9",
+    figure: "Figure | None" = None,
+) -> "Figure":
     """Draw rigid bodies at chosen frames, side by side, each as its shape, shaded by Lambert's law.
 
     `shapes` is a `Shape` for all bodies or one for each: `solids.box`, `cylinder`, `capsule`, `sphere`, or
-    `Shape(*meshes.read_mesh(file)).at(-center)`. For the rest see `plot.cloth`. Returns the figure.
+    `Shape(*meshes.read_mesh(file)).at(-center)`. The other arguments are as in `plot.cloth`. Returns the figure.
 
     Example:
         >>> from physjax.show import solids
@@ -93,15 +105,15 @@ def bodies(
     )
 
 
-def take_bodies(who: str, film: Trajectory, shapes: Any) -> tuple[Frames, np.ndarray]:
+def take_bodies(who: str, film: Trajectory, shapes: Shape | Sequence[Shape]) -> tuple[Frames, np.ndarray]:
     """The frames of a run with the vertices of all shapes in place of the bodies, and the triangles between them."""
     return place_shapes(*check_shapes(who, film, shapes))
 
 
-def check_shapes(who: str, film: Trajectory, shapes: Any) -> tuple[Frames, np.ndarray, list[Shape]]:
+def check_shapes(who: str, film: Trajectory, shapes: Shape | Sequence[Shape]) -> tuple[Frames, np.ndarray, list[Shape]]:
     """Centres of mass of a run's bodies, their quaternions `(frames, bodies, 4)`, and a checked shape for each."""
     seen = take_lanes(who, film, dims=(3,))
-    if not hasattr(film.state, "orientation"):
+    if not isinstance(film.state, RigidBodies):
         raise TypeError(
             f"{who}: got a film of {type(film.state).__name__}, expected RigidBodies. plot.paths draws others."
         )
@@ -114,7 +126,7 @@ def check_shapes(who: str, film: Trajectory, shapes: Any) -> tuple[Frames, np.nd
 
 
 def place_shapes(seen: Frames, orientation: np.ndarray, shapes: list[Shape]) -> tuple[Frames, np.ndarray]:
-    """The shapes of bodies where they are: frames with all their vertices, and the triangles between them."""
+    """The shapes of bodies moved and turned with them: frames of all their vertices, and the triangles between them."""
     corners = [
         seen.position[:, i, None] + _rotate(orientation[:, i, None], shape.vertices[None])
         for i, shape in enumerate(shapes)
@@ -124,10 +136,10 @@ def place_shapes(seen: Frames, orientation: np.ndarray, shapes: list[Shape]) -> 
 
 
 def build_inertia_box(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
-    """The box of one density that has a body's mass and moments: edges a² = 6 (I₂ + I₃ - I₁)/m, and so on.
+    """The uniform box with a body's mass and principal moments: edges a² = 6 (I₂ + I₃ - I₁)/m, and so on.
 
-    A body with a pivot has the moments about its centre of mass, I - m (|r|² 1 - r rᵀ), and an edge without a moment
-    across it is drawn thin. `lane` is the body's place in a batch.
+    Of a body with a pivot the moments about its centre of mass are taken, I - m (|r|² 1 - r rᵀ). An edge of length zero is
+    drawn thin. `lane` is the index of the body in a batch.
     """
     own = lambda leaf, axes: np.asarray(leaf, float)[lane if np.ndim(leaf) > axes else ()]  # noqa: E731
     mass, tensor = own(inertia.mass, 0), own(inertia.tensor, 2)
@@ -136,19 +148,20 @@ def build_inertia_box(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
         tensor = tensor - mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     moments, axes = np.linalg.eigh(tensor)
     edges = np.sqrt(np.maximum(6 / mass * (moments.sum() - 2 * moments), 0.0))
-    edges = np.maximum(edges, 0.02 * edges.max())
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    edges = np.maximum(edges, MIN_EDGE_SHARE * edges.max())
+    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, not a mirror: faces keep their outer side
     solid = box(edges)
     return solid._replace(vertices=solid.vertices @ axes.T)
 
 
 def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors turned by unit quaternions (w, x, y, z): v + 2w (u × v) + 2u × (u × v)."""
     twice = 2 * np.cross(q[..., 1:], v)
     return v + q[..., :1] * twice + np.cross(q[..., 1:], twice)
 
 
-def _revolve_outline(outline: Any, axis: int) -> Shape:
-    """The body that an outline (distance from the axis, place on it) leaves when it goes round the axis."""
+def _revolve_outline(outline: Sequence[Sequence[float] | np.ndarray], axis: int) -> Shape:
+    """The solid of revolution of an outline of points (distance from the axis, place along it)."""
     angle = np.linspace(0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
     rings = [np.stack([r * np.cos(angle), r * np.sin(angle), np.full(CIRCLE_CORNERS, z)], axis=1) for r, z in outline]
     here, there = np.arange(CIRCLE_CORNERS), np.roll(np.arange(CIRCLE_CORNERS), -1)
@@ -161,5 +174,9 @@ def _revolve_outline(outline: Any, axis: int) -> Shape:
         ]
     vertices, faces = np.roll(np.concatenate(rings), axis - 2, axis=1), np.concatenate(faces)
     a, b, c = vertices[faces].transpose(1, 0, 2)
-    seen = np.abs(np.cross(b - a, c - a)).max(axis=1) > 1e-12 * np.abs(vertices).max() ** 2  # at the poles half are not
-    return Shape(vertices, faces[seen])
+    has_area = np.abs(np.cross(b - a, c - a)).max(axis=1) > MIN_AREA_SHARE * np.abs(vertices).max() ** 2
+    return Shape(vertices, faces[has_area])
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,26 +1,39 @@
-"""Springs as lines, coloured by how far they are stretched."""
+"""Springs as lines, coloured by their strain."""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
+from physjax.physics.springs.assembly import Lattice
 from physjax.physics.springs.springs import Springs
-from physjax.show import obstacles
 from physjax.show.frames import Frames, find_batch_index, find_intact_springs, get_springs, pick_frames, take_frames
 from physjax.show.panels import Scenery, build_scenery, draw_colour_bar, draw_panels
 from physjax.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
 STRAIN_PERCENTILE = 99.0
 """The colours reach to this percentile of the strains; arrows on the colour bar say that some go beyond."""
-
 MAX_BLOWN_UP_STRAIN = 1.0
-"""The colours of a run that blew up reach no farther: a spring of twice its length."""
+"""The largest strain that has a colour in a run that blew up: a spring of twice its length."""
+MIN_STRAIN_LIMIT = 0.01
+"""The largest strain that has a colour where no spring is stretched at all."""
 
 
 class SpringLines(NamedTuple):
-    """How springs are drawn: pairs, rest lengths [m], which hold at each frame (None: all), and the colours' scale."""
+    """How springs are drawn: pairs of nodes, rest lengths [m], which are intact, and the strain at which the colours end.
+
+    `held` `(frames, springs)` says which are intact at each frame; None: all of them.
+    """
 
     pairs: np.ndarray
     rest: np.ndarray
@@ -34,8 +47,8 @@ class SpringLines(NamedTuple):
         has_rest = self.rest > 0
         return np.where(has_rest, (length - self.rest) / np.where(has_rest, self.rest, 1.0), np.inf)
 
-    def colours(self) -> Any:
-        """From strain to colour: blue is pressed, grey is at rest, orange is stretched."""
+    def colours(self) -> "ScalarMappable":
+        """From strain [%] to colour: blue is compressed, grey is at rest, orange is stretched."""
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import LinearSegmentedColormap, Normalize
 
@@ -45,17 +58,17 @@ class SpringLines(NamedTuple):
 
 def springs(
     film: Trajectory,
-    sheet: Any,
+    sheet: Lattice | Springs,
     frames: int | Iterable[int] | None = None,
     *,
     scene: int | Sequence[int] | None = None,
     limit: int | float | None = None,
-    figure: Any = None,
-) -> Any:
+    figure: "Figure | None" = None,
+) -> "Figure":
     """Draw springs in the plane or in space at chosen frames, coloured by strain; broken ones are dashed grey lines.
 
-    `sheet` is a lattice or its springs. The colours go from -limit to limit, a strain; by default as far as 99 % of
-    the springs that are shown. The others are as in `plot.cloth`. Returns the figure.
+    `sheet` is a lattice or its springs. The colours go from -limit to limit, a strain; by default as far as that of
+    99 % of the springs that are shown. The other arguments are as in `plot.cloth`. Returns the figure.
 
     Example:
         >>> figure = plot.springs(wave, sheet, frames=[0, 10])
@@ -72,7 +85,9 @@ def springs(
     )
 
 
-def take_springs(who: str, film: Any, sheet: Any, scene: Any) -> tuple[Frames, Springs, tuple[int, ...]]:
+def take_springs(
+    who: str, film: Trajectory, sheet: Lattice | Springs, scene: int | Sequence[int] | None
+) -> tuple[Frames, Springs, tuple[int, ...]]:
     """The film of one scene, the springs in it, and the place of that scene in a batch."""
     given = get_springs(who, sheet)
     seen = take_frames(who, film, scene=scene, nodes=given.nodes)
@@ -80,66 +95,67 @@ def take_springs(who: str, film: Any, sheet: Any, scene: Any) -> tuple[Frames, S
 
 
 def build_spring_lines(
-    who: str, film: Trajectory, given: Springs, index: tuple, seen: Frames, frames: Any, limit: int | float | None
+    who: str,
+    film: Trajectory,
+    given: Springs,
+    index: tuple[int, ...],
+    run: Frames,
+    frames: Sequence[int],
+    limit: int | float | None,
 ) -> SpringLines:
-    """What is known of the springs at all frames; the colours' scale fits the given frames."""
+    """How the springs of the scene `index` of a batch are drawn; the colours end at `limit`, or fit the given frames."""
     held = find_intact_springs(who, film, given, index)
     rest = np.broadcast_to(_select_scene(np.asarray(given.rest_length, float), index), len(given.pairs))
     spring_lines = SpringLines(given.pairs, rest, held, 1.0)
     if limit is None:
-        most = [_strain_percentile(spring_lines, seen.position[frame].astype(float), frame) for frame in frames]
-        limit = min(max(most), MAX_BLOWN_UP_STRAIN if seen.blew_up else np.inf)
+        most = [_strain_percentile(spring_lines, run.position[frame].astype(float), frame) for frame in frames]
+        limit = min(max(most), MAX_BLOWN_UP_STRAIN if run.blew_up else np.inf)
     elif not limit > 0:
         raise ValueError(f"{who}: got limit={limit}, expected a strain > 0, e.g. 0.05 for five per cent.")
-    return spring_lines._replace(limit=float(limit) or 0.01)
+    return spring_lines._replace(limit=float(limit) or MIN_STRAIN_LIMIT)
 
 
 def _select_scene(numbers: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
-    """The numbers of one scene, out of those for all springs or one each behind as many axes of scenes as it takes."""
+    """The numbers for the springs of one scene: the same for all scenes, or with axes of scenes in front."""
     axes = max(numbers.ndim - 1, 0)
     return numbers[tuple(i if n > 1 else 0 for i, n in zip(index[len(index) - axes :], numbers.shape, strict=False))]
 
 
 def _strain_percentile(spring_lines: SpringLines, position: np.ndarray, frame: int) -> float:
-    """The strain that nearly all springs keep below in a frame, in either direction."""
+    """The strain that nearly all springs stay below in a frame, stretched or compressed."""
     strain = np.abs(spring_lines.strain(position))
     shown = np.isfinite(strain) & (True if spring_lines.held is None else spring_lines.held[frame])
     return float(np.percentile(strain[shown], STRAIN_PERCENTILE)) if shown.any() else 0.0
 
 
-def draw_springs(ax: Any, scenery: Scenery, frame: int, *, spring_lines: SpringLines) -> list[Any]:
-    """Draw a frame: one collection of the springs that hold, and one, dashed and grey, of those that do not."""
+def draw_springs(ax: "Axes", scenery: Scenery, frame: int, *, spring_lines: SpringLines) -> "list[Artist]":
+    """Draw a frame: one collection of the intact springs, and one, dashed and grey, of the broken ones."""
     position = scenery.position(frame)
     ends = position[spring_lines.pairs]
-    seen = scenery.stage.contains(position)[spring_lines.pairs].all(axis=1)
-    held = seen if spring_lines.held is None else seen & spring_lines.held[frame]
+    inside = scenery.stage.contains(position)[spring_lines.pairs].all(axis=1)
+    held = inside if spring_lines.held is None else inside & spring_lines.held[frame]
     colours = spring_lines.colours().to_rgba(100 * spring_lines.strain(position)[held])
     width = float(np.clip(60 / np.sqrt(len(ends)), 0.5, 2.2))
     drawn = [_build_collection(ends[held], colors=colours, linewidths=width, zorder=3)] if held.any() else []
-    if (seen & ~held).any():
-        drawn.append(
-            _build_collection(ends[seen & ~held], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2)
-        )
+    broken = inside & ~held
+    if broken.any():
+        drawn.append(_build_collection(ends[broken], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2))
     for collection in drawn:
-        (ax.add_collection if scenery.flat else ax.add_collection3d)(collection)
-    return (
-        drawn
-        if scenery.flat
-        else drawn + obstacles.draw_balls(ax, scenery.stage, scenery.contacts, scenery.run.time[frame], scenery.up)
-    )
+        (ax.add_collection if scenery.flat else cast("Axes3D", ax).add_collection3d)(collection)
+    return [*drawn, *scenery.draw_solids(ax, frame)]
 
 
-def draw_strain_bar(figure: Any, where: dict[str, Any], *, spring_lines: SpringLines) -> None:
-    """What the colours mean, below all panels."""
+def draw_strain_bar(figure: "Figure", where: dict[str, Any], *, spring_lines: SpringLines) -> None:
+    """The colour bar of the strains, below all panels."""
     draw_colour_bar(figure, where, spring_lines.colours(), "strain [%]", extend="both")
 
 
-def _build_collection(ends: np.ndarray, **style: Any) -> Any:
-    """Lines between ends `(draw_springs, 2, dim)`."""
+def _build_collection(ends: np.ndarray, **style: Any) -> "LineCollection | Line3DCollection":
+    """Lines between ends `(springs, 2, dim)`."""
     if ends.shape[-1] == 2:
         from matplotlib.collections import LineCollection
 
-        return LineCollection(ends, **style)
+        return LineCollection(list(ends), **style)
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     return Line3DCollection(ends, **style)

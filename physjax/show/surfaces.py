@@ -2,15 +2,22 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from physjax.physics.springs.assembly import Lattice
 from physjax.show import obstacles
 from physjax.show.frames import get_faces, pick_frames, take_frames
 from physjax.show.obstacles import LIGHT_DIRECTION
 from physjax.show.panels import Scenery, build_scenery, draw_panels
 from physjax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.figure import Figure
+    from matplotlib.typing import ColorType
+    from mpl_toolkits.mplot3d import Axes3D
 
 AMBIENT_BRIGHTNESS = 0.5
 """Brightness of a face that stands edge on to the light."""
@@ -20,13 +27,13 @@ SMOOTH_EDGE_COSINE = 0.85
 
 def cloth(
     film: Trajectory,
-    sheet: Any,
+    sheet: Lattice,
     frames: int | Iterable[int] | None = None,
     *,
     scene: int | Sequence[int] | None = None,
-    color: Any = "#56B4E9",
-    figure: Any = None,
-) -> Any:
+    color: "ColorType" = "#56B4E9",
+    figure: "Figure | None" = None,
+) -> "Figure":
     """Draw the faces of a cloth, a jelly or a mesh in space at chosen frames, side by side, shaded by Lambert's law.
 
     `sheet` is the lattice that the film's scene was made from. `frames` are numbers of frames, negative ones from the
@@ -47,11 +54,11 @@ def cloth(
 
 
 def draw_surface(
-    ax: Any, scenery: Scenery, frame: int, *, faces: np.ndarray, color: Any, closed: bool = False
-) -> list[Any]:
-    """Draw a frame into axes in space: faces behind a ball, the balls, and the faces before them.
+    ax: "Axes3D", scenery: Scenery, frame: int, *, faces: np.ndarray, color: "ColorType", closed: bool = False
+) -> "list[Artist]":
+    """Draw a frame into axes in space: faces behind a solid obstacle, the obstacles, and the faces in front of them.
 
-    Of what is `closed` the far side comes first: sorted by depth with the near one, some of it would show through.
+    Of a `closed` surface the far side comes first: sorted by depth with the near one, some of it would show through.
     """
     from matplotlib.colors import to_rgb
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -59,13 +66,13 @@ def draw_surface(
     position = scenery.position(frame)
     faces = faces[scenery.stage.contains(position)[faces].all(axis=1)]
     triangles, colours = position[faces], compute_brightness(position, faces, scenery.up)[:, None] * to_rgb(color)
-    balls = obstacles.find_balls(scenery.stage, scenery.contacts, scenery.run.time[frame])
-    layers = np.where(obstacles.find_hidden(balls, triangles.mean(axis=1), ax, scenery.up), 2, 4)
+    solids = obstacles.find_solids(scenery.stage, scenery.contacts, scenery.run.time[frame])
+    layers = np.where(obstacles.find_hidden(solids, triangles.mean(axis=1), ax, scenery.up), 2, 4)
     if closed:
         layers[find_back_faces(triangles, ax)] = 1
     groups = [(triangles[layers == layer], colours[layers == layer], layer) for layer in (1, 2, 4)]
-    groups += [(ball.corners, obstacles.shade_ball(ball, scenery.up), 3) for ball in balls]
-    drawn = [
+    groups += [(solid.outline.polygons, obstacles.shade_solid(solid, scenery.up), 3) for solid in solids]
+    drawn: list[Artist] = [
         Poly3DCollection(polygons, facecolors=shades, edgecolors=shades, linewidths=0.3, zorder=order)
         for polygons, shades, order in groups
         if len(polygons)
@@ -75,20 +82,21 @@ def draw_surface(
     return drawn
 
 
-def find_back_faces(triangles: np.ndarray, ax: Any) -> np.ndarray:
+def find_back_faces(triangles: np.ndarray, ax: "Axes3D") -> np.ndarray:
     """Which triangles `(n, 3, 3)` are seen from behind: their corners go round clockwise as the axes show them."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-    x, y, _ = proj_transform(*triangles.reshape(-1, 3).T, ax.get_proj())
+    x, y, z = triangles.reshape(-1, 3).T
+    x, y, _ = proj_transform(x, y, z, ax.get_proj())
     (xa, xb, xc), (ya, yb, yc) = (np.reshape(part, (-1, 3)).T for part in (x, y))
     return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
 
 
 def compute_brightness(position: np.ndarray, faces: np.ndarray, up: int = 1) -> np.ndarray:
-    """Lambert's law, seen from both sides: ambient light and the rest times |n·l|, for each face.
+    """Brightness of each face by Lambert's law, lit from both sides: a + (1 - a) |n·l|, with a the ambient light.
 
-    n at a corner is the mean of the faces around it, by area, so that a coarse sheet looks as smooth as it is meant;
-    where they turn sharply, as on the edge of a block, it is the face's own.
+    The normal n at a corner is the mean of those of the faces around it, weighted by area, so that a coarse sheet looks
+    smooth; where the faces meet at a sharp angle, as on the edge of a block, it is the face's own.
     """
     a, b, c = position[faces].transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)

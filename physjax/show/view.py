@@ -1,6 +1,6 @@
-"""A run in three dimensions that can be turned, zoomed and played: one page of its own, which fetches nothing.
+"""A run in space as one HTML page on which it can be turned, zoomed and played, and which fetches nothing.
 
-Drawn by three.js (MIT, see web/vendor/), which travels inside the page.
+It is drawn by three.js (MIT, see web/vendor/), which is part of the page.
 """
 
 import base64
@@ -10,15 +10,23 @@ import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from jax.typing import ArrayLike
 
-from physjax.physics.contacts.shapes import Sphere
 from physjax.show import obstacles
-from physjax.show.drawables import Bodies, Dots, Lines, Surface, choose_drawable
+from physjax.show.drawables import Bodies, Dots, Lines, Look, Surface, choose_drawable
 from physjax.show.films import schedule
 from physjax.show.frames import find_batch_index
+from physjax.show.page_data import (
+    QUANTISATION_STEPS,
+    Json,
+    build_padded_box,
+    describe_obstacle,
+    pack_frames,
+    quantise_positions,
+)
 from physjax.show.pages import check_output_path, embed_page, fill_page, read_web_file, write_page
 from physjax.show.panels import Scenery, build_scenery
 from physjax.show.plot import MAX_DRAWN_LANES
@@ -27,25 +35,24 @@ from physjax.show.stage import AZIMUTH, ELEVATION
 from physjax.show.trails import build_trails
 from physjax.trajectory import Trajectory
 
-QUANTISATION_STEPS = 32767
-"""A place is one of so many steps to either side of the middle of the box, along each of its sides."""
-HIDDEN_CODE = -32768
-"""Stands for a place outside of the box, or for none: what touches it is not drawn."""
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+
 NOTEBOOK_HEIGHT_PIXELS = 560
-"""Of the page inside a notebook [pixels]."""
+"""Height of the page inside a notebook [pixels]."""
 COLOUR_COUNT = 256
 """Colours of a colour bar."""
 
 
 class View:
-    """A page with the frames of a run, to be turned, zoomed and played. Shows itself in a notebook; `.save("x.html")`.
+    """A page with the frames of a run, to be turned, zoomed and played. A notebook shows it; `.save("x.html")` writes it.
 
     Example:
         >>> isinstance(animate.view(wave, sheet), animate.View)
         True
     """
 
-    def __init__(self, content: dict[str, Any]):
+    def __init__(self, content: Json):
         self._content = content
         self.frames = tuple(content["frames"])
         self.fps = content["fps"]
@@ -54,7 +61,7 @@ class View:
         return f"<View of {len(self.frames)} frames, a page of {len(self.page()) / 1e6:.2g} MB>"
 
     def page(self) -> str:
-        """The page: HTML that needs nothing else."""
+        """The HTML, which needs no other file."""
         data = json.dumps(self._content, separators=(",", ":")).replace("<", "\\u003c")
         return fill_page("view.html", THREE=_load_library(), FILM=data)
 
@@ -71,20 +78,20 @@ class View:
 
 def view(
     film: Trajectory,
-    shown: Any = None,
+    shown: Look | None = None,
     *,
     scene: int | Sequence[int] | None = None,
-    color: Any = None,
+    color: "ColorType | ArrayLike | None" = None,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> View:
-    """A run in space as a page to turn, zoom, pan and play, with floors, walls and balls, axes in metres, up as in the scene.
+    """A run in space as a page to turn, zoom, pan and play, with its surfaces, axes in metres, and up as in the scene.
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
     lines coloured by strain, a `solids` shape or one for each body. Without it bodies are boxes of their inertia, nodes
     are joined by the scene's springs, and everything else is dots with their paths. `color` is one for surfaces and
-    bodies, a value for each lane for dots. It plays `speed` seconds of the run a second, in `fps` frames. Places are
-    rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
+    bodies, a value for each lane for dots. The page plays `speed` seconds of the run a second, in `fps`
+    frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
     Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; 2-D films are for
     `animate.paths` and `animate.springs`.
@@ -98,14 +105,14 @@ def view(
     whole = seen.surface() if isinstance(seen, Bodies) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
     scenery = build_scenery(whole.run, frames)
-    index = find_batch_index(who, film, scene) if isinstance(seen, Lines) else ()
-    part = {
-        Surface: lambda: _describe_surface(seen, scenery, frames, color),
-        Bodies: lambda: _describe_bodies(seen, scenery, frames, color),
-        Lines: lambda: _describe_lines(who, film, seen, index, scenery, frames),
-        Dots: lambda: _describe_dots(who, seen, scenery, frames, color),
-    }[type(seen)]()
-    low, high = scenery.stage
+    if isinstance(seen, Surface):
+        part = _describe_surface(seen, scenery, frames, color)
+    elif isinstance(seen, Bodies):
+        part = _describe_bodies(seen, scenery, frames, color)
+    elif isinstance(seen, Lines):
+        part = _describe_lines(who, film, seen, find_batch_index(who, film, scene), scenery, frames)
+    else:
+        part = _describe_dots(who, seen, scenery, frames, color)
     return View(
         {
             "frames": frames,
@@ -113,39 +120,21 @@ def view(
             "time": scenery.run.time[frames].tolist(),
             "fps": fps,
             "speed": float(speed),
-            "low": low.tolist(),
-            "high": high.tolist(),
-            "reach": [end.tolist() for end in _padded_box(scenery)],
+            "low": scenery.stage.low.tolist(),
+            "high": scenery.stage.high.tolist(),
+            "reach": [end.tolist() for end in build_padded_box(scenery)],
             "from": [ELEVATION, AZIMUTH],
             "up": scenery.up,
             "light": obstacles.LIGHT_DIRECTION.tolist(),
             "part": part,
-            "obstacles": [_describe_obstacle(contact, scenery, frames) for contact in scenery.contacts],
+            "obstacles": [describe_obstacle(contact, scenery, frames) for contact in scenery.contacts],
         }
     )
 
 
-def pack_frames(array: np.ndarray) -> str:
-    """Numbers as text: the change from frame to frame (whole numbers wrap around), deflated, in base 64."""
-    steps = np.diff(array, axis=0, prepend=np.zeros_like(array[:1]))
-    return base64.b64encode(zlib.compress(steps.tobytes(), 9)).decode()
-
-
-def quantise_positions(scenery: Scenery, position: np.ndarray) -> np.ndarray:
-    """Positions `(frames, nodes, 3)` [m] as 16-bit whole numbers, `HIDDEN_CODE` where they are not inside of the box."""
-    low, high = _padded_box(scenery)
-    inside = scenery.stage.contains(position)[..., None]
-    share = (np.where(inside, position, low) - low) / (high - low)
-    return np.where(inside, np.round((2 * share - 1) * QUANTISATION_STEPS), HIDDEN_CODE).astype(np.int16)
-
-
-def _padded_box(scenery: Scenery) -> tuple[np.ndarray, np.ndarray]:
-    """The box with the slack within which it `contains` a point."""
-    slack = 0.06 * scenery.stage.size
-    return scenery.stage.low - slack, scenery.stage.high + slack
-
-
-def _describe_surface(seen: Surface, scenery: Scenery, frames: list[int], color: Any) -> dict[str, Any]:
+def _describe_surface(
+    seen: Surface, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None"
+) -> Json:
     return {
         "kind": "surface",
         "color": _to_hex(color),
@@ -155,8 +144,8 @@ def _describe_surface(seen: Surface, scenery: Scenery, frames: list[int], color:
     }
 
 
-def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: Any) -> dict[str, Any]:
-    """Centres and quaternions (x, y, z, w), which keep shapes rigid, and each shape's triangles."""
+def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None") -> Json:
+    """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape."""
     turn = np.roll(seen.orientation[frames], -1, axis=-1)
     return {
         "kind": "bodies",
@@ -170,8 +159,8 @@ def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: A
 
 def _describe_lines(
     who: str, film: Trajectory, seen: Lines, index: tuple[int, ...], scenery: Scenery, frames: list[int]
-) -> dict[str, Any]:
-    """Springs in colours of their strain; those that parted are grey."""
+) -> Json:
+    """Springs in the colours of their strain; broken ones are grey."""
     spring_lines = build_spring_lines(who, film, seen.springs, index, seen.run, frames, None)
     position = seen.run.position[frames].astype(float)
     bar = spring_lines.colours()
@@ -189,9 +178,11 @@ def _describe_lines(
     }
 
 
-def _describe_dots(who: str, seen: Dots, scenery: Scenery, frames: list[int], color: Any) -> dict[str, Any]:
-    """Lanes in colours of their own, with the whole of their paths if they are few."""
-    _, trails = build_trails(who, seen.run, 1, color, 0.0)
+def _describe_dots(
+    who: str, seen: Dots, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None"
+) -> Json:
+    """Lanes in colours of their own, with their whole paths if there are few of them."""
+    _, trails = build_trails(who, seen.run, 1, cast("ArrayLike | None", color), 0.0)
     return {
         "kind": "dots",
         "nodes": seen.run.position.shape[1],
@@ -201,25 +192,10 @@ def _describe_dots(who: str, seen: Dots, scenery: Scenery, frames: list[int], co
     }
 
 
-def _describe_obstacle(contact: Any, scenery: Scenery, frames: list[int]) -> dict[str, Any]:
-    """A ball, or sheets of glass where they are first seen, and how far they are then and how fast they go."""
-    velocity = getattr(contact, "velocity", None)
-    drift = {"velocity": np.zeros(3).tolist() if velocity is None else np.asarray(velocity, float).tolist()}
-    if isinstance(contact, Sphere):
-        ball = {"center": np.asarray(contact.center, float).tolist(), "radius": float(contact.radius)}
-        return {"kind": "ball", "inside": bool(contact.inside), "since": 0.0} | ball | drift
-    found: list[np.ndarray] = []
-    for since in scenery.run.time[frames]:
-        found = [sheet for sheet in obstacles.build_sheets(contact, scenery.stage, since) if len(sheet) > 2]
-        if found or velocity is None:
-            break
-    return {"kind": "sheets", "sheets": [s.tolist() for s in found], "since": float(since)} | drift
-
-
-def _to_hex(color: Any) -> str:
+def _to_hex(color: "ColorType | ArrayLike | None") -> str:
     from matplotlib.colors import to_hex
 
-    return to_hex("#56B4E9" if color is None else color)
+    return to_hex("#56B4E9" if color is None else cast("ColorType", color))
 
 
 @cache

@@ -1,1 +1,1 @@
-"""How a scene moves: methods, the loop that repeats them, and the diffrax bridge."""
+"""How a scene moves: the methods, the loop that repeats their steps, and the bridge to diffrax."""

@@ -2,21 +2,23 @@
 
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.backend import any_lane
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.loops import Time, moment_at, to_float_time
 from physjax.particles import append_axes, demand_particles
-from physjax.parts import as_module
-from physjax.scene import project
+from physjax.parts import Force, as_module
+from physjax.scene import Scene, project
+from physjax.stepping.registry import PromisingMethod
+from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
 from physjax.vectors import norm
 
 SAFETY_FACTOR, LECTURE_SAFETY_FACTOR, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR = 0.8, 0.9, 0.2, 5.0
@@ -32,7 +34,7 @@ class Steps(NamedTuple):
     Shaped like the scene's status: for each lane where lanes are independent, for each scene where they are coupled.
     """
 
-    state: Any
+    state: PyTree
     accepted: Int[Array, "..."]
     rejected: Int[Array, "..."]
     shortest: Float[Array, "..."]
@@ -46,7 +48,7 @@ class Adaptive(eqx.Module):
     the mean over itself of what jumps in it: the system is asked for it, as it was before any step.
     """
 
-    method: Any
+    method: Callable
     atol: Float[Array, ""]
     rtol: Float[Array, ""]
     dt_min: Float[Array, ""] | None
@@ -55,11 +57,11 @@ class Adaptive(eqx.Module):
     error: str = eqx.field(static=True)
     tries: int | None = eqx.field(static=True)
 
-    def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+    def __call__(self, system: System, t: Time, state: S, dt: ArrayLike) -> S:
         """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
         return self.report(system, t, state, dt).state
 
-    def check_scene(self, scene: Any) -> Any:
+    def check_scene(self, scene: Scene) -> Scene:
         """The scene as it is; a ValueError where something is answered once a dt, whatever the steps in it."""
         late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if f.remembers]
         late += [
@@ -75,9 +77,9 @@ class Adaptive(eqx.Module):
             )
         return scene
 
-    def report(self, system: Any, t: Time, state: Any, dt: Time) -> Steps:
+    def report(self, system: System, t: Time, state: PyTree, dt: Time) -> Steps:
         """The state a dt later, with the counts of accepted and rejected steps."""
-        shape, kind = getattr(system, "status_shape", ()), jax.tree.leaves(state)[0].dtype
+        shape, kind = read_traits(system).status_shape, leaf_dtype(state)
         dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
         floor = SHORTEST_STEP_SHARE * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
         # less than rounding would never arrive
@@ -113,7 +115,7 @@ class Adaptive(eqx.Module):
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
     def _attempt_step(
-        self, system: Any, t: Any, dt: Any, next_stop: Callable, floor: Any, ceiling: Any, walk: "_Progress"
+        self, system: System, t: Time, dt: Array, next_stop: Callable, floor: Array, ceiling: Array, walk: "_Progress"
     ) -> "_Progress":
         """One step whole and in halves, kept if both agree, and the next length from how well they do."""
         stop = next_stop(walk.elapsed)
@@ -144,12 +146,10 @@ class Adaptive(eqx.Module):
             error=jnp.where(good, error, walk.error),
         )
 
-    def _take_step(self, system: Any, t: Any, state: Any, h: Any) -> Any:
+    def _take_step(self, system: System, t: Time, state: S, h: Array) -> S:
         """One step of the method, with what jumps in time replaced by its mean over the step."""
-        if hasattr(system, "averaged_over_step"):
-            # over no time there is no mean, and what is not a number would come back in a derivative
-            system = system.averaged_over_step(t, jnp.where(h > 0, h, 1.0))
-        return self.method(system, t, state, h)
+        # over no time there is no mean, and what is not a number would come back in a derivative
+        return self.method(average_over_step(system, t, jnp.where(h > 0, h, 1.0)), t, state, h)
 
     def _choose_factor(self, walk: "_Progress", h: Array, error: Array, good: Array) -> Array:
         """By how much longer the next step may be: as this error allows, or less where errors have been growing.
@@ -170,7 +170,7 @@ class Adaptive(eqx.Module):
             jnp.isfinite(error), jnp.clip(factor, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR), SMALLEST_STEP_FACTOR
         )
 
-    def _measure_error(self, start: Any, whole: Any, halves: Any, shape: tuple) -> Array:
+    def _measure_error(self, start: S, whole: S, halves: S, shape: tuple[int, ...]) -> Array:
         """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
         if self.error == "velocity":
             demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
@@ -178,11 +178,11 @@ class Adaptive(eqx.Module):
             return _max_over_shared_step(worst, shape) / self.atol.astype(worst.dtype)
         return _scaled_norm(jax.tree.map(lambda a, b: a - b, halves, whole), self._tolerance(start, halves), shape)
 
-    def _tolerance(self, start: Any, end: Any) -> Any:
+    def _tolerance(self, start: S, end: S) -> S:
         size = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), start, end)
         return jax.tree.map(lambda s: self.atol.astype(s.dtype) + self.rtol.astype(s.dtype) * s, size)
 
-    def _choose_first_step(self, system: Any, t: Any, state: Any, dt: Any) -> Array:
+    def _choose_first_step(self, system: System, t: Time, state: PyTree, dt: Array) -> Array:
         """A first length from how fast the state and its rate change (Hairer, Nørsett, Wanner, section II.4)."""
         shape, tolerance = dt.shape, self._tolerance(state, state)
         slope = system.rate(t, state)
@@ -199,7 +199,7 @@ class Adaptive(eqx.Module):
 class _Progress(NamedTuple):
     """How far the steps have come; `last` and `error` are of the last step accepted."""
 
-    state: Any
+    state: PyTree
     elapsed: Array
     h: Array
     accepted: Array
@@ -254,7 +254,7 @@ def adaptive(
         raise TypeError(f"adaptive: got the method {method!r}, expected one such as methods.rk4.")
     if error not in ("state", "velocity"):
         raise ValueError(f"error: got {error!r}, expected 'state' or 'velocity' (the lecture's).")
-    promised = getattr(method, "promises", None)
+    promised = method.promises.order if isinstance(method, PromisingMethod) else None
     if order is None and promised is None:
         raise ValueError("adaptive: the method promises no order. Give order=.")
     atol, rtol = as_real_quantity("atol", atol, above=0.0), as_real_quantity("rtol", rtol, above=0.0)
@@ -271,13 +271,13 @@ def adaptive(
         rtol,
         dt_min,
         dt_max,
-        as_positive_integer("order", promised.order if order is None else order),
+        as_positive_integer("order", promised if order is None else order),
         error,
         None if tries is None else as_positive_integer("tries", tries),
     )
 
 
-def count_steps(scene: Any, method: Adaptive, *, dt: ArrayLike, steps: int) -> Steps:
+def count_steps(scene: Scene, method: Adaptive, *, dt: ArrayLike, steps: int) -> Steps:
     """Accepted and rejected steps of a run, dt by dt along a leading axis, the states at its ends with them.
 
     Example:
@@ -291,7 +291,7 @@ def count_steps(scene: Any, method: Adaptive, *, dt: ArrayLike, steps: int) -> S
 
 
 @eqx.filter_jit
-def _count_steps(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
+def _count_steps(scene: Scene, method: Adaptive, dt: Array, steps: int) -> Steps:
     dt = dt.astype(scene.state.dtype)
     arrays, still = eqx.partition(scene, eqx.is_array)
 
@@ -305,11 +305,11 @@ def _count_steps(scene: Any, method: Adaptive, dt: Array, steps: int) -> Steps:
     return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
 
 
-def _find_jumps(system: Any, t: Time, shape: tuple) -> list[Array]:
+def _find_jumps(system: System, t: Time, shape: tuple[int, ...]) -> list[Array]:
     """When forces of a system jump, after t [s]: `(*shape, k)` each."""
     found = []
-    for force in getattr(system, "forces", ()):
-        for times in map(jnp.asarray, getattr(force, "discontinuities", tuple)()):
+    for force in read_traits(system).forces:
+        for times in map(jnp.asarray, force.discontinuities() if isinstance(force, Force) else ()):
             own = shape and times.shape[: len(shape)] == shape
             times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
             found.append(times - jnp.broadcast_to(to_float_time(t), shape)[..., None])
@@ -324,14 +324,14 @@ def _find_next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
     return dt
 
 
-def _scaled_norm(state: Any, tolerance: Any, shape: tuple) -> Array:
+def _scaled_norm(state: S, tolerance: S, shape: tuple[int, ...]) -> Array:
     """The largest component in units of its tolerance, for each scene or lane."""
     leaves = [jnp.abs(a / b) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(tolerance), strict=True)]
     largest = reduce(jnp.maximum, [leaf[..., i] for leaf in leaves for i in range(leaf.shape[-1])])
     return _max_over_shared_step(largest, shape)
 
 
-def _max_over_shared_step(number: Array, shape: tuple) -> Array:
+def _max_over_shared_step(number: Array, shape: tuple[int, ...]) -> Array:
     """The largest number of all lanes that share a step."""
     return jnp.max(number, axis=tuple(range(len(shape), number.ndim)))
 

@@ -12,14 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from physjax.backend import count_lane_blocks
 from physjax.scene import Scene
-
-LANES_PER_BLOCK = 8192
-"""Lanes in a block: 200 kB of state in 3-D and float32, which leaves room for the stages of a step in a 1 MB cache."""
-MIN_LANES_TO_CUT = 6 * LANES_PER_BLOCK
-"""Fewer lanes than this fit a cache as they are."""
-MIN_STEPS_PER_FRAME = 8
-"""Fewer steps between frames do not pay for cutting."""
 
 
 class Blocks(NamedTuple):
@@ -37,14 +31,9 @@ class Blocks(NamedTuple):
         arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)
-        if (
-            total < MIN_LANES_TO_CUT
-            or frame_steps < MIN_STEPS_PER_FRAME
-            or jax.default_backend() != "cpu"
-            or not scene.may_be_cut()
-        ):
+        count = count_lane_blocks(total, frame_steps)
+        if count is None or not scene.may_be_cut():
             return None
-        count = math.ceil(total / LANES_PER_BLOCK)
         blocks = cls(scene.state.lanes, math.ceil(total / count), count)
         return blocks if all(jax.tree.leaves(scene.build_lane_mask(moving))) else None
 

@@ -6,16 +6,20 @@ simulation", 1998) it is (1 - dt ∂a/∂v - dt² ∂a/∂x) Δv = dt (a + dt �
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from physjax.backend import any_lane
+from physjax.linear import MAX_CRAMER_UNKNOWNS, solve_columns
 from physjax.loops import Time
+from physjax.scene import Scene
 from physjax.stepping.krylov import (
     SolveReport,
     Vector,
@@ -24,7 +28,8 @@ from physjax.stepping.krylov import (
     stabilised_biconjugate_gradients,
 )
 from physjax.stepping.registry import Promises
-from physjax.vectors import scale
+from physjax.stepping.system import S, System, has_no_lanes, linearise_at, read_traits
+from physjax.vectors import components, scale, stack_components
 
 LARGEST_FORCING_TERM, SMALLEST_FORCING_TERM = 0.1, 1e-3
 """Relative residuals of the linear systems around Newton's method: of the first guess, and three digits an iteration."""
@@ -60,8 +65,7 @@ class ImplicitEuler(eqx.Module):
             raise ValueError(
                 f"ImplicitEuler: got tolerance={self.tolerance!r}, expected a number between 0 and 1: the relative residual."
             )
-        for name, least in (("iterations", 1), ("newton", 0)):
-            value = getattr(self, name)
+        for name, value, least in (("iterations", self.iterations, 1), ("newton", self.newton, 0)):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"ImplicitEuler: got {name}={value!r}, expected an integer of at least {least}.")
 
@@ -69,15 +73,15 @@ class ImplicitEuler(eqx.Module):
     def __name__(self) -> str:
         return "implicit_euler" if not self.newton else "implicit_euler, converged"
 
-    def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+    def __call__(self, system: System, t: Time, state: S, dt: ArrayLike) -> S:
         """The state after a step dt [s] from the time t [s]."""
         return self._take_step(system, t, state, dt)[0]
 
-    def report(self, scene: Any, dt: ArrayLike, t: ArrayLike = 0.0) -> SolveReport:
+    def report(self, scene: Scene, dt: ArrayLike, t: ArrayLike = 0.0) -> SolveReport:
         """How the step from `scene.state` is solved: relative residual, products with the matrix, ok; for each scene."""
         return _report_step(self, scene, jnp.asarray(t, scene.state.dtype), jnp.asarray(dt, scene.state.dtype))
 
-    def _take_step(self, system, t, state, dt):
+    def _take_step(self, system: System, t: Time, state: S, dt: ArrayLike) -> tuple[S, SolveReport]:
         step = _Step.of(system, t, state, dt)
         if self.newton:
             guess, _ = self._solve_linearised(step, LARGEST_FORCING_TERM)
@@ -95,7 +99,7 @@ class ImplicitEuler(eqx.Module):
         b = step.kick(jax.tree.map(jnp.add, rate, push(ahead)))
         matvec = lambda u: _subtract(u, step.kick(push(move(step.mask_held(u)))))  # noqa: E731
         return self._solve_linear(
-            step, matvec, b, max(rough, self._limit_tolerance(b)), getattr(linearised, "dissipative_symmetric", False)
+            step, matvec, b, max(rough, self._limit_tolerance(b)), read_traits(linearised).dissipative_symmetric
         )
 
     def _solve_converged(self, step: "_Step", guess: Vector) -> tuple[Vector, SolveReport]:
@@ -147,7 +151,7 @@ class ImplicitEuler(eqx.Module):
         self, step: "_Step", matvec: Callable, b: Vector, tolerance: ArrayLike, dissipative_symmetric: bool
     ) -> tuple[Vector, SolveReport]:
         """matvec(u) = b: in closed form where lanes stand alone, else iteratively."""
-        if step.is_independent and len(b) == 1 and b[0].ndim and b[0].shape[-1] in _CLOSED_FORMS:
+        if step.is_independent and len(b) == 1 and b[0].ndim and b[0].shape[-1] <= MAX_CRAMER_UNKNOWNS:
             u = _solve_per_lane(matvec, b[0])
             r, size = _subtract(b, matvec([u])), step.inner(b, b)
             products = jnp.full(size.shape, b[0].shape[-1], jnp.int32)
@@ -166,14 +170,14 @@ class ImplicitEuler(eqx.Module):
 class _Step(NamedTuple):
     """A step to be solved: the system, the end of the step [s], the start's state, and which of its leaves a kick changes."""
 
-    system: Any
+    system: System
     end: Time
-    state: Any
+    state: PyTree
     dt: ArrayLike
     kicked_leaves: tuple[bool, ...]
 
     @classmethod
-    def of(cls, system: Any, t: Time, state: Any, dt: ArrayLike) -> "_Step":
+    def of(cls, system: System, t: Time, state: PyTree, dt: ArrayLike) -> "_Step":
         kicked_leaves = []
 
         def kick(state):
@@ -189,17 +193,17 @@ class _Step(NamedTuple):
     @property
     def is_independent(self) -> bool:
         """Whether each lane is a system of its own."""
-        return not getattr(self.system, "couples", True) or getattr(self.state, "lanes", None) == ()
+        return not read_traits(self.system).couples or has_no_lanes(self.state)
 
-    def linearised(self) -> Any:
+    def linearised(self) -> System:
         """The system that is linearised."""
-        return self.system.linearised_at(self.end, self.state) if hasattr(self.system, "linearised_at") else self.system
+        return linearise_at(self.system, self.end, self.state)
 
-    def select_kicked(self, tree: Any) -> Vector:
+    def select_kicked(self, tree: PyTree) -> Vector:
         """The leaves of a state that a kick changes."""
         return [leaf for leaf, place in zip(jax.tree.leaves(tree), self.kicked_leaves, strict=True) if place]
 
-    def kick(self, rate: Any) -> Vector:
+    def kick(self, rate: PyTree) -> Vector:
         """dt·rate, of the leaves that a kick changes."""
         return self.select_kicked(self.system.kick(jax.tree.map(jnp.zeros_like, self.state), rate, self.dt))
 
@@ -209,10 +213,10 @@ class _Step(NamedTuple):
 
     def mask_held(self, u: Vector) -> Vector:
         """u without what held lanes have of it, which is nothing: the matrix then is symmetric in them as well."""
-        held = getattr(self.system, "held", None)
+        held = read_traits(self.system).held
         return u if held is None else [scale(1 - held.astype(leaf.dtype), leaf) for leaf in u]
 
-    def add_change(self, u: Vector) -> Any:
+    def add_change(self, u: Vector) -> PyTree:
         """The state with u added to what a kick changes."""
         leaves, tree = jax.tree.flatten(self.state)
         more = iter(u)
@@ -220,7 +224,7 @@ class _Step(NamedTuple):
             tree, [leaf + next(more) if place else leaf for leaf, place in zip(leaves, self.kicked_leaves, strict=True)]
         )
 
-    def end_state(self, u: Vector) -> Any:
+    def end_state(self, u: Vector) -> PyTree:
         """The state at the end of the step."""
         return self.system.drift(self.add_change(u), self.dt)
 
@@ -232,12 +236,13 @@ class _Step(NamedTuple):
         """Σ a·b/m for each system."""
         return self._sum([scale(1 / self._mass(), p) for p in a], b)
 
-    def _mass(self):
-        mass = getattr(self.system, "mass", 1.0)
-        return mass if hasattr(mass, "ndim") else jnp.ones((), self.dt.dtype)
+    def _mass(self) -> jax.Array:
+        """The mass of each lane; one for bodies, whose momenta are not velocities, and for a system without masses."""
+        mass = read_traits(self.system).mass
+        return mass if isinstance(mass, jax.Array | np.ndarray) else jnp.ones((), self.dt.dtype)
 
-    def _sum(self, a, b):
-        kept = len(getattr(self.system, "status_shape", ()))
+    def _sum(self, a: Vector, b: Vector) -> jax.Array:
+        kept = len(read_traits(self.system).status_shape)
         return sum(_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True))
 
 
@@ -250,7 +255,9 @@ def _subtract(a: Vector, b: Vector) -> Vector:
     return [p - q for p, q in zip(a, b, strict=True)]
 
 
-def _search_line(step, residual, u, change, square, going):
+def _search_line(
+    step: _Step, residual: Callable, u: Vector, change: Vector, square: jax.Array, going: jax.Array
+) -> tuple[Vector, jax.Array]:
     """u - change, each system's change halved until its residual falls, left out where that does not help."""
 
     def tried(share):
@@ -274,38 +281,13 @@ def _search_line(step, residual, u, change, square, going):
 
 
 def _solve_per_lane(matvec: Callable, b: jax.Array) -> jax.Array:
-    """The solution of a small system for each lane, by Cramer's rule."""
+    """The solution of a system of up to three unknowns for each lane, its columns read off by multiplying unit vectors."""
     dim = b.shape[-1]
     units = [jnp.broadcast_to(jnp.eye(dim, dtype=b.dtype)[i], b.shape) for i in range(dim)]
-    columns = [[matvec([e])[0][..., i] for i in range(dim)] for e in units]
-    return jnp.stack(_CLOSED_FORMS[dim](columns, [b[..., i] for i in range(dim)]), axis=-1)
-
-
-def _cramer_1(columns, b):
-    return [b[0] / columns[0][0]]
-
-
-def _cramer_2(columns, b):
-    p, q = columns
-    det = lambda a, b: a[0] * b[1] - a[1] * b[0]  # noqa: E731
-    whole = det(p, q)
-    return [det(b, q) / whole, det(p, b) / whole]
-
-
-def _cramer_3(columns, b):
-    p, q, r = columns
-
-    def det(a, b, c):
-        first, second, third = (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2] for i in range(3))
-        return a[0] * first + a[1] * second + a[2] * third
-
-    whole = det(p, q, r)
-    return [det(b, q, r) / whole, det(p, b, r) / whole, det(p, q, b) / whole]
-
-
-_CLOSED_FORMS = {1: _cramer_1, 2: _cramer_2, 3: _cramer_3}
+    columns = [components(matvec([e])[0]) for e in units]
+    return stack_components(solve_columns(columns, components(b)))
 
 
 @jax.jit
-def _report_step(method: ImplicitEuler, scene: Any, t: jax.Array, dt: jax.Array) -> SolveReport:
+def _report_step(method: ImplicitEuler, scene: Scene, t: jax.Array, dt: jax.Array) -> SolveReport:
     return method._take_step(scene.averaged_over_step(t, dt), t, scene.state, dt)[1]

@@ -6,7 +6,6 @@ or have the shape of the lanes.
 """
 
 import math
-from typing import Any
 
 import jax
 from jax.typing import ArrayLike
@@ -15,11 +14,12 @@ from physjax.loops import Time
 from physjax.stepping.adaptive import adaptive, count_steps
 from physjax.stepping.implicit import ImplicitEuler
 from physjax.stepping.registry import METHODS, Promises, promises
+from physjax.stepping.system import S, System
 from physjax.vectors import scale
 
 
 @promises(order=1, evaluations=1, stability_limit=0.0)
-def euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+def euler(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Explicit Euler: follow the slope at the start. One force a step; gains energy at any step without damping.
 
     The lecture's EulerStep and its listing `position += velocity*dt; velocity += acceleration*dt`.
@@ -33,7 +33,7 @@ def euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
 
 
 @promises(order=1, evaluations=1, stability_limit=2.0)
-def semi_implicit_euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+def semi_implicit_euler(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Kick, then drift with the new velocity: one force a step, energy bounded.
 
     The lecture's `Vel = Vel + Acc*dt; Pos = Pos + Vel*dt`, which it also calls Euler; a different method with different
@@ -48,7 +48,7 @@ def semi_implicit_euler(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
 
 
 @promises(order=2, evaluations=2, stability_limit=0.0)
-def midpoint(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+def midpoint(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Follow the slope found half a step ahead: second order; an oscillation grows by √(1 + (ωdt)⁴/4) a step.
 
     Example:
@@ -61,7 +61,7 @@ def midpoint(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
 
 
 @promises(order=2, evaluations=2, stability_limit=2.0)
-def verlet(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+def verlet(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Velocity Verlet: half a kick, drift, half a kick with the force found there. Second order, energy bounded.
 
     Forces that depend on velocity see the predicted v + a·dt at the end of the step, which keeps the order at 2.
@@ -78,7 +78,7 @@ def verlet(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
 
 
 @promises(order=2, evaluations=1, stability_limit=2.0, order_with_drag=1)
-def leapfrog(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+def leapfrog(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Drift half way, kick, drift on: second order for one force a step, the cheapest where forces depend on position alone.
 
     Forces that depend on velocity see the old one, and the order falls to 1.
@@ -93,7 +93,7 @@ def leapfrog(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
 
 
 @promises(order=4, evaluations=4, stability_limit=2 * math.sqrt(2))
-def rk4(system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+def rk4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """The classical Runge-Kutta method: four slopes, weighted 1 2 2 1. Loses energy near its limit.
 
     The lecture's RK4Integration.
@@ -132,7 +132,7 @@ __all__ = [
 ]
 
 
-def _move_along(state: Any, slope: Any, dt: ArrayLike) -> Any:
+def _move_along(state: S, slope: S, dt: ArrayLike) -> S:
     """The state moved along a slope: y + dt·k."""
     return jax.tree.map(lambda y, k: y + scale(dt, k), state, slope)
 

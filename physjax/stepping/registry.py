@@ -1,7 +1,7 @@
 """The registry of methods, and what a method promises. Charts, tests and tables iterate it; nobody lists methods twice."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 METHODS: dict[str, Callable] = {}
 """Every method by name, in the order of their definition."""
@@ -23,6 +23,13 @@ class Promises(NamedTuple):
     evaluations: int
     stability_limit: float
     order_with_drag: int
+
+
+@runtime_checkable
+class PromisingMethod(Protocol):
+    """A method that says what it promises, as all of the library's do but those that subdivide a step."""
+
+    promises: Promises
 
 
 def promises(

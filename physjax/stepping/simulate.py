@@ -5,6 +5,7 @@ them compiles nothing. Reverse mode keeps the state at the frames and recomputes
 O(frames + √save_every).
 """
 
+import functools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +19,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from physjax.backend import MIN_LANES_TO_SELECT, split_compilation
+from physjax.backend import MIN_LANES_TO_SELECT, jit_untransformed, split_compilation
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
@@ -75,10 +76,9 @@ def simulate(
     method = as_module(method)
     warn_of_recompilation("simulate", (*(plain.function for plain in find_plain_functions((scene, method))), record))
     first_step, dt = _check_first_step(first_step, steps, dt)
-    rollout = _rollout
-    if record is None and _is_untransformed((scene, method, dt, first_step)):
-        rollout = _rollout_few_lanes if _is_compile_bound(scene) else _rollout_untransformed
-    return rollout(scene, method, dt, first_step, steps // save_every, save_every, record)
+    alone = record is None and _is_untransformed((scene, method, dt, first_step))
+    run = _get_standalone_run(_is_compile_bound(scene)) if alone else _run_inside
+    return run(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
 def _run_steps(scene, method, dt, first_step, frames, save_every, record):
@@ -127,20 +127,15 @@ def _run_steps(scene, method, dt, first_step, frames, save_every, record):
     )
 
 
-_rollout = jax.jit(_run_steps, static_argnames=("frames", "save_every", "record"))
-# XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster; JAX lets us
-# ask only where no other transformation is around the run
-WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
-_rollout_untransformed = jax.jit(
-    _run_steps, static_argnames=("frames", "save_every", "record"), compiler_options=WIDE_VECTOR_OPTIONS
-)
-# timed contacts are many small computations, over which the emitters of jax 0.10 take twice the time of the older ones
-_OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
-_rollout_few_lanes = jax.jit(
-    _run_steps,
-    static_argnames=("frames", "save_every", "record"),
-    compiler_options=WIDE_VECTOR_OPTIONS | _OLDER_EMITTER_OPTIONS,
-)
+RUN_STRUCTURE = ("frames", "save_every", "record")
+"""What of a run is structure and not numbers."""
+_run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
+
+
+@functools.cache
+def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
+    """The compiled run where no transformation is around it; made at the first run, since it asks for the device."""
+    return jit_untransformed(_run_steps, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
 
 
 def _is_compile_bound(scene: Scene) -> bool:
@@ -149,7 +144,7 @@ def _is_compile_bound(scene: Scene) -> bool:
 
 
 def _is_untransformed(run: tuple) -> bool:
-    """Whether a run on a CPU is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
+    """Whether a run is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
     scene, method, *_ = run
     path = () if scene.prescribed_motion is None else (scene.prescribed_motion.path,)
     source = () if scene.emitter is None else (scene.emitter.source,)
@@ -158,7 +153,7 @@ def _is_untransformed(run: tuple) -> bool:
         map(_is_library_definition, (*map(type, parts), *(plain.function for plain in find_plain_functions(parts))))
     )
     traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
-    return ours and not traced and jax.default_backend() == "cpu"
+    return ours and not traced
 
 
 def _is_library_definition(definition: Any) -> bool:
@@ -168,8 +163,8 @@ def _is_library_definition(definition: Any) -> bool:
 
 def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
     """Step number i of a loop."""
-    if scene.compiles_in_pieces and jax.default_backend() == "cpu":
-        scene = scene.replace(state=jax.tree.map(lambda leaf: split_compilation(leaf, i), scene.state))
+    if scene.compiles_in_pieces:
+        scene = scene.replace(state=split_compilation(scene.state, i))
     return scene.step(method, moment_at(i, dt, scene.state.dtype), dt)
 
 

@@ -1,1 +1,1 @@
-"""What you ask of a scene: closed forms, accuracy, energy."""
+"""What you ask of a scene: accuracy, stability, energy, ablation, sweeps and inverse problems, each with its charts."""

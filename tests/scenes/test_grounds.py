@@ -6,7 +6,7 @@ import pytest
 
 from physjax.scenes.driving import Kerb
 from physjax.scenes.snow import Hill
-from physjax.show import obstacles
+from physjax.show.outlines import build_outline
 from physjax.show.stage import Stage
 
 KERB = Kerb(13.0, 0.4)
@@ -50,11 +50,11 @@ def test_on_a_hill_the_gap_grows_along_its_normal_and_bends_as_it_does():
     np.testing.assert_allclose(HILL.curvature_acceleration(0.0, place, velocity), curvature_acceleration, atol=1e-10)
 
 
-def test_a_profile_is_drawn_from_side_to_side():
+def test_a_kerb_is_drawn_from_side_to_side_with_a_sharp_edge():
     stage = Stage(np.array([10.0, -1.0, -2.0]), np.array([16.0, 1.0, 2.0]))
-    ground, face, top = obstacles.build_sheets(KERB, stage, 0.0)
+    ground, face, top = build_outline(KERB, stage, 0.0).polygons
     np.testing.assert_allclose(face[:, 0], 13.0)
     np.testing.assert_allclose([np.ptp(ground[:, 2]), np.ptp(face[:, 1]), top[:, 1].min()], [4.0, 0.4, 0.4])
     before = stage._replace(high=np.array([12.0, 1.0, 2.0]))
-    (ground,) = obstacles.build_sheets(KERB, before, 0.0)
+    (ground,) = build_outline(KERB, before, 0.0).polygons
     assert np.ptp(ground[:, 1]) == 0.0

@@ -7,7 +7,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from physjax import Particles, Scene, contacts, forces, lattices, methods, plot, rigid, simulate
-from physjax.show import obstacles
+from physjax.show import obstacles, outlines
 from physjax.show.obstacles import LIGHT_DIRECTION
 from physjax.show.stage import Stage
 from physjax.show.surfaces import AMBIENT_BRIGHTNESS, compute_brightness
@@ -42,7 +42,9 @@ def test_every_face_is_drawn_at_every_frame_that_was_asked_for(drape):
     for ax in figure.axes:
         assert polygons(ax) == len(sheet.faces) == 40
         assert polygons(ax, zorders=(3,)) == len(
-            obstacles.find_balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[0].corners
+            obstacles.find_solids(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)[
+                0
+            ].outline.polygons
         )
         assert polygons(ax, zorders=(0,)) == 1  # the floor
         assert len(ax.collections) <= 4  # however many faces
@@ -151,12 +153,12 @@ def test_a_face_without_area_is_no_trouble():
 
 
 def test_a_plane_is_cut_to_the_box():
-    floor = obstacles._cut_box(CUBE, np.array([0.3, 0.5, 0.3]), np.array([0.0, 1.0, 0.0]))
+    floor = outlines._cut_box(CUBE, np.array([0.3, 0.5, 0.3]), np.array([0.0, 1.0, 0.0]))
     assert area(floor) == pytest.approx(1.0)
-    slope = obstacles._cut_box(CUBE, np.full(3, 0.5), np.full(3, 3**-0.5))
+    slope = outlines._cut_box(CUBE, np.full(3, 0.5), np.full(3, 3**-0.5))
     assert len(slope) == 6
     assert area(slope) == pytest.approx(0.75 * 3**0.5)
-    assert len(obstacles._cut_box(CUBE, np.full(3, 2.0), np.array([0.0, 1.0, 0.0]))) == 0
+    assert len(outlines._cut_box(CUBE, np.full(3, 2.0), np.array([0.0, 1.0, 0.0]))) == 0
 
 
 def test_a_floor_that_is_near_comes_into_the_picture_and_a_far_one_does_not():
@@ -185,10 +187,10 @@ def test_every_shape_is_drawn_in_space():
 
 def test_surfaces_that_move_are_drawn_where_they_are_and_those_that_differ_are_left_out():
     bat = contacts.Sphere((0, 0, 0), 0.1, velocity=(2.0, 0, 0))
-    (ball,) = obstacles.find_balls(CUBE, (bat,), 0.25)
-    np.testing.assert_allclose(ball.center, [0.5, 0, 0])
-    assert len(ball.corners) == len(ball.normals) > 100
-    assert len(obstacles.find_balls(CUBE, (bat,), 1.0)[0].corners) == 0
+    found = outlines.build_outline(bat, CUBE, 0.25)
+    np.testing.assert_allclose(found.ball.center, [0.5, 0, 0])
+    assert len(found.polygons) == len(found.normals) > 100
+    assert len(outlines.build_outline(bat, CUBE, 1.0).polygons) == 0
     assert obstacles.include_obstacles(CUBE, (bat,), (0.0, 0.75)).high[0] == 1.6
     ramp = contacts.Plane(np.zeros((4, 3)), (0, 1, 0))
     assert obstacles.select_shared_surfaces((bat, ramp)) == (bat,)
@@ -199,8 +201,8 @@ def test_of_what_bodies_touch_the_surface_is_drawn():
     shown = obstacles.select_shared_surfaces(
         (rigid.SurfaceContact(rigid.ContactPoints.sphere(0.1), floor), rigid.Balls(0.1))
     )
-    assert shown[0] is floor
-    assert [len(obstacles.build_sheets(surface, CUBE, 0.0)) for surface in shown] == [1, 0]
+    assert shown == (floor,)
+    assert len(outlines.build_outline(floor, CUBE, 0.0).polygons) == 1
 
 
 def test_what_is_behind_a_ball_is_known(drape):
@@ -208,8 +210,8 @@ def test_what_is_behind_a_ball_is_known(drape):
     ax = plot.cloth(film, sheet, 0).axes[0]
     up, turn = np.radians([ax.elev, ax.azim])
     eye = np.array([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)])
-    ball = obstacles.find_balls(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)
-    points = ball[0].center + np.array([eye, -eye, -eye + [0, 1.0, 0]]) * 0.4
+    ball = obstacles.find_solids(Stage(np.full(3, -1.0), np.full(3, 1.0)), film.scene.contacts, 0.0)
+    points = ball[0].outline.ball.center + np.array([eye, -eye, -eye + [0, 1.0, 0]]) * 0.4
     assert obstacles.find_hidden(ball, points, ax).tolist() == [False, True, False]
 
 

@@ -24,7 +24,7 @@ def thrown(up):
 
 def pixels(run):
     """The last picture of a film, without the names and numbers of the axes."""
-    figure = animate.paths(run).plot_run(-1)
+    figure = animate.paths(run).still(-1)
     figure.set_dpi(40)
     ax = figure.axes[0]
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
@@ -44,7 +44,7 @@ def test_a_film_of_another_up_is_the_same_but_for_the_names_of_the_axes():
 @pytest.mark.parametrize("up", [0, 1, 2])
 def test_axes_in_space_stand_on_the_ground(up):
     run = thrown(up)
-    for ax in (plot.paths(run), plot_run(run).axes[0], animate.paths(run).plot_run(0).axes[0]):
+    for ax in (plot.paths(run), plot_run(run).axes[0], animate.paths(run).still(0).axes[0]):
         assert ax._vertical_axis == up
     assert animate.view(run)._content["up"] == up
     lamp = obstacles.orient_up(obstacles.LIGHT_DIRECTION, up)

@@ -13,7 +13,7 @@ import pytest
 
 from physjax import Particles, Scene, animate, contacts, forces, inertia, lattices, methods, rigid, simulate
 from physjax.show import solids
-from physjax.show.view import HIDDEN_CODE, QUANTISATION_STEPS
+from physjax.show.page_data import HIDDEN_CODE, QUANTISATION_STEPS
 
 
 def content(view):

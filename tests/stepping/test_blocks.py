@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, forces, methods, simulate
+from physjax.backend import MIN_LANES_TO_CUT, MIN_STEPS_PER_FRAME
 from physjax.checks import quantity
 from physjax.physics.forces import independent
-from physjax.stepping.blocks import MIN_LANES_TO_CUT, MIN_STEPS_PER_FRAME, Blocks
+from physjax.stepping.blocks import Blocks
 from physjax.vectors import dot
 
 pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="lanes are cut for a CPU's cache only")

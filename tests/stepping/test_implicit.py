@@ -11,8 +11,8 @@ import optimistix
 import pytest
 
 from physjax import Particles, Pins, Scene, forces, lattices, methods, ode_term, simulate
-from physjax.physics.springs import Springs
 from physjax.parts import as_module
+from physjax.physics.springs import Springs
 from physjax.stepping.krylov import conjugate_gradients, stabilised_biconjugate_gradients
 from physjax.stepping.methods import ImplicitEuler
 from physjax.stepping.simulate import sample_states

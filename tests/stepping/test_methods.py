@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, forces, methods, ode_term, reference, simulate
-from physjax.physics.forces import independent
 from physjax.parts import as_module
+from physjax.physics.forces import independent
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import sample_states
 from physjax.vectors import dot, norm

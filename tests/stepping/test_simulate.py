@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from physjax import Particles, Scene, contacts, forces, lattices, methods, simulate
-from physjax.physics.forces import independent
 from physjax.parts import Force
+from physjax.physics.forces import independent
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import state_after
 

@@ -8,6 +8,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
+from physjax.cubics import Cubic
 from physjax.particles import Particles
 from physjax.physics.contacts.resting import ContactMode
 from physjax.vectors import dot
@@ -63,13 +64,10 @@ def find_dip(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, en
     d0, d1 = face.signed_distance(t, start.position), face.signed_distance(t + dt, end.position)
     r0 = dt * dot(face.relative(start.velocity), face.normal_at(t, start.position))
     r1 = dt * dot(face.relative(end.velocity), face.normal_at(t + dt, end.position))
-    b, a = 3 * (d1 - d0) - 2 * r0 - r1, r0 + r1 - 2 * (d1 - d0)
-    cubic = lambda s: d0 + s * (r0 + s * (b + s * a))  # noqa: E731
-    root = jnp.sqrt(jnp.maximum(b * b - 3 * a * r0, 0.0))
-    # the quotient that does not cancel; where its denominator is zero the value is infinite and not taken
-    lowest = jnp.where(b > 0, -r0 / (b + root), (root - b) / (3 * a))
-    highest = jnp.where(b < 0, r0 / (root - b), -(root + b) / (3 * a))
-    lowest, depth = face.deepest(t, dt, start, end, (lowest, cubic(lowest)))
+    cubic = Cubic.through(d0, d1, r0, r1)
+    # infinite or NaN where the cubic has no minimum, and then not taken
+    lowest, highest = cubic.extrema()
+    lowest, depth = face.deepest(t, dt, start, end, (lowest, cubic.at(lowest)))
     last = jnp.where(d1 < 0, 1.0, jnp.inf)
     last = jnp.where((lowest > 0) & (lowest < 1) & (depth < 0), lowest, last)
     last = jnp.where((d0 < 0) & (r0 < 0), 0.0, last)
@@ -77,7 +75,7 @@ def find_dip(face: eqx.Module, t: ArrayLike, dt: ArrayLike, start: Particles, en
     bounced = (d0 <= float(jnp.finfo(d0.dtype).eps) ** 0.5 * r0) & (r0 > 0) & (highest > 0) & (highest < last)
     first = jnp.where(bounced, 0.1 * highest, 0.0)
     below = jnp.where(last == 1.0, d1, depth)
-    return Dip(first, last, jnp.where(first > 0, cubic(first), d0), below)
+    return Dip(first, last, jnp.where(first > 0, cubic.at(first), d0), below)
 
 
 def evaluate_guards(

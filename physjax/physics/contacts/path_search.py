@@ -8,6 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.backend import any_lane, bounded_while_loop
+from physjax.cubics import Cubic
 from physjax.particles import Particles
 from physjax.vectors import norm, scale
 
@@ -26,10 +27,9 @@ def find_path_dip(
     gap falls slowly (J. C. Hart, The Visual Computer 12, 1996): however thin what is in the way, it is met. Then down to
     where the gap is least, in steps that double.
     """
-    p, chord = start.position, end.position - start.position
-    u, w = scale(dt, start.velocity), scale(dt, end.velocity)
-    b, a = 3.0 * chord - 2.0 * u - w, u + w - 2.0 * chord
-    signed_distance = lambda s: face.signed_distance(t + s * dt, p + scale(s, u + scale(s, b + scale(s, a))))  # noqa: E731
+    p = start.position
+    path = Cubic.through(p, end.position, scale(dt, start.velocity), scale(dt, end.velocity))
+    signed_distance = lambda s: face.signed_distance(t + s * dt, path.at(s))  # noqa: E731
     falling = lambda s: jax.jvp(signed_distance, (s,), (jnp.ones_like(s),))  # noqa: E731
     far = jnp.maximum(bound_path_length(face, dt, start, end), float(jnp.finfo(p.dtype).tiny))
     touch = 64 * float(jnp.finfo(p.dtype).eps) * (norm(p) + far)

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.backend import any_lane, bounded_while_loop, materialise_where
+from physjax.linear import eliminate
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.scene import Scene
@@ -201,29 +202,17 @@ def _select_place(place: tuple, surface_terms: list[tuple]) -> tuple:
 
 def _solve_normal_forces(weights: list[list[Array]], wanted: list[Array], presses: list[Array]) -> list[Array]:
     """The N >= 0 with Σ_j W_ij N_j = w_i of the surfaces that press; one that would have to pull lets go."""
-    forces = _eliminate(weights, wanted, presses)
+    forces = _eliminate_pressed(weights, wanted, presses)
     if len(forces) > 1:
-        forces = _eliminate(
+        forces = _eliminate_pressed(
             weights, wanted, [jnp.where(force > 0, p, 0.0) for p, force in zip(presses, forces, strict=True)]
         )
     return [jnp.maximum(force, 0.0) for force in forces]
 
 
-def _eliminate(weights: list[list[Array]], wanted: list[Array], presses: list[Array]) -> list[Array]:
+def _eliminate_pressed(weights: list[list[Array]], wanted: list[Array], presses: list[Array]) -> list[Array]:
     """Gaussian elimination, lane by lane, over those that press."""
-    rows, right, inverse = [list(row) for row in weights], list(wanted), []
-    for i, press in enumerate(presses):
-        usable = (press > 0) & (rows[i][i] > PARALLEL_SIN_SQUARED)
-        inverse.append(jnp.where(usable, 1.0 / jnp.where(usable, rows[i][i], 1.0), 0.0))
-        for j in range(i + 1, len(rows)):
-            share = rows[j][i] * inverse[i]
-            rows[j] = _add_scaled(rows[j], -share, rows[i])
-            right[j] = right[j] - share * right[i]
-    forces = [None] * len(rows)
-    for i in reversed(range(len(rows))):
-        known = sum(rows[i][k] * forces[k] for k in range(i + 1, len(rows)))
-        forces[i] = (right[i] - known) * inverse[i]
-    return forces
+    return eliminate(weights, wanted, lambda i, pivot: (presses[i] > 0) & (pivot > PARALLEL_SIN_SQUARED))
 
 
 class _ContactState(NamedTuple):

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete_or_none, demand_all, demand_direction, quantity
+from physjax.cubics import Cubic
 from physjax.particles import Particles
 from physjax.physics.contacts.surface import INHERITED_FIELDS, Surface
 from physjax.vectors import broadcast_vector, dot, norm, scale, unit
@@ -149,16 +150,13 @@ class Sphere(Surface):
             return dip
         p, q = self._offset(t, start.position), self._offset(t + dt, end.position)
         u, w = scale(dt, self.relative(start.velocity)), scale(dt, self.relative(end.velocity))
-        chord = q - p
-        b, a = 3.0 * chord - 2.0 * u - w, u + w - 2.0 * chord
+        path, chord = Cubic.through(p, q, u, w), q - p
         length = dot(chord, chord)
         s = jnp.clip(-dot(p, chord) / jnp.maximum(length, _SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
-        at = p + scale(s, u + scale(s, b + scale(s, a)))
-        slope, turn = u + scale(s, 2.0 * b + scale(3.0 * s, a)), 2.0 * b + scale(6.0 * s, a)
-        steep = dot(slope, slope) + dot(at, turn)
+        at, slope = path.at(s), path.slope(s)
+        steep = dot(slope, slope) + dot(at, path.curvature(s))
         s = jnp.clip(s - jnp.where(steep > 0, dot(at, slope) / jnp.where(steep > 0, steep, 1.0), 0.0), 0.0, 1.0)
-        at = p + scale(s, u + scale(s, b + scale(s, a)))
-        return s, norm(at) - self.radius
+        return s, norm(path.at(s)) - self.radius
 
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
         """The foot of the perpendicular from the center."""

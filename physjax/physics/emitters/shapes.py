@@ -1,10 +1,10 @@
-"""Where particles are born: each source is a shape that three numbers from 0 to 1 fill evenly.
+"""Sources of particles: each is a shape that is sampled uniformly by three uniform numbers from 0 to 1.
 
-A source is called with uniform numbers `(*lanes, 3)` and returns the place [m] and the direction out of the shape there,
-both `(*lanes, dim)`. Its numbers can be swept and differentiated; where a particle is born moves with them.
+A source is called with numbers `(*lanes, 3)` and returns the position [m] and the outward normal there, both `(*lanes,
+dim)`. Its parameters can be swept and differentiated: the positions move with them.
 
-Births have the same bits in every program: products are `force_rounding` before they are added, which compilers would
-otherwise do or leave as it suits the rest of the program.
+Births have the same bits in every program: products are rounded (`force_rounding`) before they are added, since compilers
+fuse the two to one operation in some programs and not in others.
 """
 
 import math
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from physjax.checks import concrete_or_none, demand_all, demand_direction, quantity
+from physjax.checks import Numbers, concrete_or_none, demand_all, demand_direction, quantity
 from physjax.loops import force_rounding
 from physjax.vectors import broadcast_vector, components, scale, stack_components, turn_left
 
@@ -39,7 +39,7 @@ class Source(eqx.Module):
 
 
 class Point(Source):
-    """All from one point; outward is any direction, all equally likely.
+    """A point, with isotropic directions.
 
     Example:
         >>> place, outward = emitters.Point((1.0, 2.0))(jnp.array([0.1, 0.2, 0.3]))
@@ -47,7 +47,7 @@ class Point(Source):
         [1. 2.]
     """
 
-    at: Float[Array, "dim"] = quantity("place of the source", "m", kind="place", per=None)
+    at: Numbers = quantity("place of the source", "m", kind="place", per=None)
 
     @property
     def dim(self) -> int:
@@ -61,7 +61,7 @@ class Point(Source):
 
 
 class Disc(Source):
-    """Evenly from a disc of a radius [m] across `normal`; in the plane, from a line as long as its diameter.
+    """A disc of a radius [m] with the given `normal`, sampled uniformly; in the plane a line as long as its diameter.
 
     Example:
         >>> disc = emitters.Disc((0.0, 0.0, 0.0), normal=(0.0, 0.0, 2.0), radius=2.0)
@@ -70,9 +70,9 @@ class Disc(Source):
         1.0 [0. 0. 1.]
     """
 
-    center: Float[Array, "dim"] = quantity("center of the disc", "m", kind="place", per=None)
-    normal: Float[Array, "dim"] = quantity("normal of the disc", "1", kind="vector", per=None)
-    radius: Float[Array, ""] = quantity("radius of the disc", "m", per=None, at_least=0)
+    center: Numbers = quantity("center of the disc", "m", kind="place", per=None)
+    normal: Numbers = quantity("normal of the disc", "1", kind="vector", per=None)
+    radius: Numbers = quantity("radius of the disc", "m", per=None, at_least=0)
 
     def __check_init__(self):
         demand_direction("normal of the disc", self.normal)
@@ -93,7 +93,7 @@ class Disc(Source):
 
 
 class Box(Source):
-    """Evenly from all of a box between two corners [m]; outward is any direction, all equally likely.
+    """The volume of a box between two corners [m], sampled uniformly, with isotropic directions.
 
     Example:
         >>> place, outward = emitters.Box((0.0, 0.0), (2.0, 4.0))(jnp.array([0.5, 0.25, 0.0]))
@@ -101,8 +101,8 @@ class Box(Source):
         [1. 1.]
     """
 
-    lower: Float[Array, "dim"] = quantity("lower corner", "m", kind="place", per=None)
-    upper: Float[Array, "dim"] = quantity("upper corner", "m", kind="place", per=None)
+    lower: Numbers = quantity("lower corner", "m", kind="place", per=None)
+    upper: Numbers = quantity("upper corner", "m", kind="place", per=None)
 
     def __check_init__(self):
         lower, upper = concrete_or_none(self.lower), concrete_or_none(self.upper)
@@ -117,7 +117,7 @@ class Box(Source):
     def __call__(self, u: Float[Array, "*lanes 3"]) -> tuple[Float[Array, "*lanes dim"], Float[Array, "*lanes dim"]]:
         """lower + u (upper - lower), and an isotropic direction."""
         share = u[..., : self.dim]
-        # the place has taken the numbers; what is left after a stretch is as even, and independent of where that was
+        # the position has used these numbers; their lower digits are uniform as well, and independent of it
         again = jnp.mod(4096.0 * u, 1.0)
         return broadcast_vector(self.lower, share) + force_rounding(
             broadcast_vector(self.upper - self.lower, share) * share
@@ -125,7 +125,7 @@ class Box(Source):
 
 
 class Sphere(Source):
-    """Evenly from a ball of a radius [m], in the plane a disc; with `shell=True` from its surface alone.
+    """A ball of a radius [m] (in the plane a disc), sampled uniformly; with `shell=True` its surface alone.
 
     Example:
         >>> place, outward = emitters.Sphere((0.0, 0.0, 0.0), radius=2.0, shell=True)(jnp.array([0.1, 0.2, 0.3]))
@@ -133,8 +133,8 @@ class Sphere(Source):
         [2. 2. 2.]
     """
 
-    center: Float[Array, "dim"] = quantity("center", "m", kind="place", per=None)
-    radius: Float[Array, ""] = quantity("radius", "m", per=None, at_least=0)
+    center: Numbers = quantity("center", "m", kind="place", per=None)
+    radius: Numbers = quantity("radius", "m", per=None, at_least=0)
     shell: bool = eqx.field(static=True, default=False)
 
     @property
@@ -152,9 +152,9 @@ class Sphere(Source):
 
 
 class Mesh(Source):
-    """Evenly from the surface of a triangle mesh: `vertices` `(n, 3)` [m], `faces` `(m, 3)`; outward by their winding.
+    """The surface of a triangle mesh, sampled uniformly: `vertices` `(n, 3)` [m], `faces` `(m, 3)`, outward by their winding.
 
-    Raises ValueError for other shapes and for faces that name no vertex.
+    Raises ValueError for other shapes and for indices that are out of range.
 
     Example:
         >>> triangle = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -176,7 +176,7 @@ class Mesh(Source):
             raise ValueError(
                 f"Mesh: got faces that name vertices {faces.min()} to {faces.max()}, expected 0 to {vertices.shape[0] - 1}."
             )
-        # an axis in front, so that no list of faces is taken for one of lanes
+        # an axis in front, so that no list of faces is mistaken for one of lanes
         self.vertices, self.faces = vertices[None], jnp.asarray(faces, jnp.int32)[None]
 
     @property
@@ -197,7 +197,7 @@ class Mesh(Source):
 
 
 def isotropic_direction(u: Float[Array, "*lanes 3"], dim: int) -> Float[Array, "*lanes dim"]:
-    """A direction, all equally likely: by Archimedes cos θ = 1 - 2u₁ is even on the sphere."""
+    """An isotropic direction: by Archimedes' hat-box theorem cos θ = 1 - 2u₁ is uniform on the sphere."""
     angle = 2 * math.pi * u[..., 0]
     if dim == 2:
         return stack_components([jnp.cos(angle), jnp.sin(angle)])
@@ -209,14 +209,14 @@ def isotropic_direction(u: Float[Array, "*lanes 3"], dim: int) -> Float[Array, "
 def direction_in_cone(
     axis: Float[Array, "*lanes dim"], cone: Float[Array, ""], u: Float[Array, "*lanes 2"]
 ) -> Float[Array, "*lanes dim"]:
-    """A direction within the half-angle `cone` [rad] about a unit axis, all equally likely; smooth in the angle, at 0 too.
+    """A uniformly distributed direction within the half-angle `cone` [rad] about a unit axis, smooth in the angle, at 0 too.
 
-    In space sin(θ/2) = √u₀ sin(cone/2); in the plane the angle is even from -cone to cone.
+    In space sin(θ/2) = √u₀ sin(cone/2); in the plane the angle is uniform from -cone to cone.
     """
     if axis.shape[-1] == 2:
         angle = cone * (2.0 * u[..., 0] - 1.0)
         return force_rounding(scale(jnp.cos(angle), axis)) + force_rounding(scale(jnp.sin(angle), turn_left(axis)))
-    # a bound beyond π, so that the sine is computed with the births: compilers have another for constants
+    # a bound that never acts but depends on u: XLA folds a constant sine at compile time, with other bits
     edge = jnp.sin(jnp.minimum(cone / 2, 2.0 + u[..., 0]))
     half = force_rounding(u[..., 0] * force_rounding(edge * edge))
     sine = 2.0 * edge * jnp.sqrt(u[..., 0] * (1.0 - half))
@@ -227,8 +227,8 @@ def direction_in_cone(
 def unit_vector_around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lanes"]) -> Float[Array, "*lanes 3"]:
     """The unit vector at an angle [rad] around a unit axis.
 
-    The frame is the one without a branch of T. Duff et al., "Building an orthonormal basis, revisited", J. Comput.
-    Graph. Tech. 6 (2017) 1.
+    The frame is the branchless one of T. Duff et al., "Building an orthonormal basis, revisited", J. Comput. Graph.
+    Tech. 6 (2017) 1.
     """
     x, y, z = components(axis)
     sign = jnp.where(z < 0, -1.0, 1.0).astype(z.dtype)
@@ -240,15 +240,17 @@ def unit_vector_around(axis: Float[Array, "*lanes 3"], angle: Float[Array, "*lan
 
 
 def unit_direction(vector: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-    """v/|v|, NaN of the zero vector, with the same bits in every program."""
+    """v/|v| with the same bits in every program; NaN for the zero vector."""
     return vector / _length(vector)[..., None]
 
 
 def _length(vector: Array) -> Array:
+    """|v| with the same bits in every program."""
     return jnp.sqrt(sum(force_rounding(each * each) for each in components(vector)))
 
 
 def _cross(a: Array, b: Array) -> Array:
+    """a × b with the same bits in every program."""
     (x, y, z), (p, q, r) = components(a), components(b)
     parts = ((y * r, z * q), (z * p, x * r), (x * q, y * p))
     return stack_components([force_rounding(one) - force_rounding(other) for one, other in parts])

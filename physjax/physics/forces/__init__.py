@@ -1,42 +1,28 @@
-"""Loads on particles: what pulls, pushes, brakes and carries them.
+"""Loads on particles: weight, drag, lift, springs to a point, gravitation, kicks and controls.
 
-`laws` are formulas of place and velocity, `weight` is gravity near the ground and the lift of fluids, `gravitation` acts
-between all pairs, `time_dependent` follows the clock, and `flows` are media that carry particles along.
+`laws` are functions of position and velocity, `weight` is gravity near the ground and buoyancy, `gravitation` acts
+between all pairs, `time_dependent` forces are functions of time, and `flows` are velocity fields of the air.
+
+A force of your own needs nothing here: any subclass of `Force` (or any function) goes into a scene, and is plotted, swept
+and ablated there. To add one to this package, write the class in the file of its kind and its name into that file's
+`__all__`; this face exports what those lists hold, so no other file changes. Its numbers are fields made with `quantity`.
+A new kind of force is a new file and two lines here.
 """
 
-from physjax.physics.forces.gravitation import Gravitation
-from physjax.physics.forces.laws import (
-    Anchor,
-    Blast,
-    Magnus,
-    QuadraticDrag,
-    RotatingFrame,
-    SphereDrag,
-    StokesDrag,
-    independent,
-)
-from physjax.physics.forces.time_dependent import Constant, Control, Kick
-from physjax.physics.forces.weight import Buoyancy, Gravity
+from physjax.physics.forces import gravitation, laws, time_dependent, weight
+from physjax.physics.forces.gravitation import *  # noqa: F403
+from physjax.physics.forces.laws import *  # noqa: F403
+from physjax.physics.forces.time_dependent import *  # noqa: F403
+from physjax.physics.forces.weight import *  # noqa: F403
 from physjax.scene import loads
 
-__all__ = [
-    "Anchor",
-    "Blast",
-    "Buoyancy",
-    "Constant",
-    "Control",
-    "Gravitation",
-    "Gravity",
-    "Kick",
-    "Magnus",
-    "QuadraticDrag",
-    "RotatingFrame",
-    "SphereDrag",
-    "StokesDrag",
-    "independent",
-    "loads",
-]
+# wildcards and sums of `__all__` are what type checkers and editors can read; a loop over the folder they cannot
+__all__ = ["loads"]
+__all__ += gravitation.__all__
+__all__ += laws.__all__
+__all__ += time_dependent.__all__
+__all__ += weight.__all__
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted(__all__)

@@ -1,6 +1,7 @@
-"""Newton's gravitation between all pairs, in tiles of sources, so that memory stays linear in the number of bodies."""
+"""Newtonian gravitation between all pairs, in tiles of sources: memory stays linear in the number of bodies."""
 
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -8,20 +9,19 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity
+from physjax.backend import SOURCES_PER_TILE
+from physjax.checks import Numbers, OptionalNumbers, quantity
 from physjax.particles import Particles
 from physjax.parts import Field
 
-SOURCES_PER_TILE = 64
-"""Sources that act at once on all bodies: small enough for the vector registers and caches, large enough to hide the loop."""
+Total = TypeVar("Total")
 
 
 class Gravitation(Field):
-    """Attraction between all lanes of the last axis: a_i = Σ_j G m_j (x_j - x_i)/d³, d² = |x_j - x_i|² + ε².
+    """Gravitation between all bodies of the last lane axis: a_i = Σ_j G m_j (x_j - x_i)/d³, d² = |x_j - x_i|² + ε².
 
-    `G` [m³/kg/s²] (the lecture's 6.673e-11 by argument) with the scene's masses, or `gm` [m³/s²] for each body, which
-    astronomers know far better than either. `softening` ε [m] is Plummer's. Two bodies at the same point do not act on
-    each other.
+    With `G` [m³/kg/s²] sources have the scene's masses; `gm` [m³/s²] gives their GM instead, which astronomers know to more
+    digits than either factor. ε is Plummer's `softening` [m]. Bodies at the same point do not attract each other.
 
     Example:
         >>> pair = Particles(jnp.array([[0.0, 0.0], [2.0, 0.0]]), jnp.zeros((2, 2)))
@@ -31,9 +31,9 @@ class Gravitation(Field):
     """
 
     couples: ClassVar[bool] = True
-    G: Float[Array, ""] = quantity("G", "m³/kg/s²", per=None, default=6.67430e-11)
-    softening: Float[Array, ""] | None = quantity("softening", "m", per=None, at_least=0, default=None)
-    gm: Float[Array, "..."] | None = quantity("gm", "m³/s²", at_least=0, default=None)
+    G: Numbers = quantity("G", "m³/kg/s²", per=None, default=6.67430e-11)
+    softening: OptionalNumbers = quantity("softening", "m", per=None, at_least=0, default=None)
+    gm: OptionalNumbers = quantity("gm", "m³/s²", at_least=0, default=None)
 
     def acceleration(
         self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]
@@ -62,7 +62,7 @@ class Gravitation(Field):
         return -0.5 * mass * _fold_tiles(add, jnp.zeros_like(gm), targets, gm)
 
     def _gm(self, state: Particles, mass: Array) -> Array:
-        """Strength of every body as a source [m³/s²]."""
+        """GM of every body as a source [m³/s²]."""
         if not state.lanes:
             raise ValueError(
                 "Gravitation: got a state without lanes, expected positions (*scenes, nodes, dim) of two or more bodies."
@@ -70,21 +70,25 @@ class Gravitation(Field):
         return jnp.broadcast_to(self.G * mass if self.gm is None else self.gm, state.lanes)
 
     def _inverse_distance(self, offsets: list[Array]) -> Array:
-        """1/d, and zero for a body and itself (or another at the same point)."""
+        """1/d, and zero between a body and itself (or another at the same point)."""
         square = sum(d * d for d in offsets[1:]) + offsets[0] * offsets[0]
         apart = square > 0
         square = jnp.where(apart, square, 1.0)
         if self.softening is not None:
             square = square + self.softening * self.softening
-        return jnp.where(apart, 1.0 / jnp.sqrt(square), 0.0)  # rsqrt's derivative passes 1/d³, which underflows
+        # not rsqrt: its derivative contains d³, which leaves the range of float32 in SI units
+        return jnp.where(apart, 1.0 / jnp.sqrt(square), 0.0)
 
 
 def _split_components(x: Array) -> list[Array]:
+    """The components of positions, one array each: `(*scenes, nodes)` [m]."""
     return [x[..., i] for i in range(x.shape[-1])]
 
 
-def _fold_tiles(add, total, sources: list[Array], strength: Array):
-    """Fold `add(total, sources, strength)` over tiles of the last axis; the last is filled up with sources of no strength."""
+def _fold_tiles(
+    add: Callable[[Total, list[Array], Array], Total], total: Total, sources: list[Array], strength: Array
+) -> Total:
+    """Fold `add(total, sources, strength)` over tiles of sources; the last tile is padded with sources of zero strength."""
     count = strength.shape[-1]
     if count <= SOURCES_PER_TILE:
         return add(total, sources, strength)
@@ -97,3 +101,10 @@ def _fold_tiles(add, total, sources: list[Array], strength: Array):
     # recomputing a tile in reverse mode keeps its memory linear too
     body = jax.checkpoint(lambda total, tile: (add(total, *tile), None), prevent_cse=False)
     return lax.scan(body, total, ([tiles(c) for c in sources], tiles(strength)))[0]
+
+
+__all__ = ["Gravitation"]
+
+
+def __dir__() -> list[str]:
+    return __all__

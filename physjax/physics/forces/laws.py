@@ -1,7 +1,7 @@
-"""Loads on particles: each force is its formula, with the units of its numbers.
+"""Forces that depend on position and velocity alone: drag, lift, the loads of a rotating frame, a spring to a point.
 
-Every number is a scalar or has the shape of the lanes; every vector is `(dim,)` for all lanes or one per lane. All have
-finite values and derivatives at rest and at coincident points.
+A number is a scalar or has the shape of the lanes, a vector is `(dim,)` or one per lane. Values and derivatives are
+finite at rest and at coincident points.
 """
 
 import math
@@ -12,72 +12,17 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity, unchecked_quantity
-from physjax.loops import Time, float32_remainder
+from physjax.checks import NestedArrayLike, Numbers, OptionalNumbers, quantity
 from physjax.particles import Particles
 from physjax.parts import Field, Force, Function
-from physjax.physics.forces.time_dependent import acting_share, is_acting
 from physjax.vectors import broadcast_vector, dot, norm, scale, spin, unit
 
-
-class Blast(Force):
-    """An explosion: away from the `center`, impulse J/(1 + (d/r)²) [N s] at the distance d, spread over a `duration` [s].
-
-    Half of J arrives at the `reach` r [m], and far out it thins as 1/d², like a wave that spreads. `impulse` J is a number
-    or one per lane (a plate that shows more of its face gets more); what stands in the center itself stays. The force
-    follows a lane that moves while it lasts. As with `Kick`, a step feels its mean in time.
-
-    Example:
-        >>> blast = forces.Blast(center=(0.0, 9.0), impulse=4.0, reach=1.0, at=0.0, duration=0.5)
-        >>> print(blast(0.1, ball, shot.mass))
-        [0. 4.]
-    """
-
-    sees_moments: ClassVar[bool] = True
-    center: Float[Array, "..."] = quantity("center of the blast", "m", kind="place")
-    impulse: Float[Array, "..."] = quantity("impulse", "N s")
-    reach: Float[Array, "..."] = quantity("reach of the blast", "m", above=0)
-    at: Float[Array, "..."] = quantity("start of the blast", "s")
-    duration: Float[Array, "..."] = quantity("duration of the blast", "s", above=0)
-    at_rest: Float[Array, "..."] | None = unchecked_quantity(
-        "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
-    )
-
-    def __post_init__(self):
-        self.at_rest = float32_remainder(self.at, self.at_rest)
-
-    def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """J/(1 + (d/r)²)/duration away from the center while the blast lasts [N]."""
-        return scale(jnp.where(is_acting(self, t, state), 1 / self.duration, 0.0), self.lane_impulse(state))
-
-    def lane_impulse(self, state: Particles) -> Float[Array, "*lanes dim"]:
-        """The impulse that each lane gets if it stays where it is [N s]."""
-        d = state.position - broadcast_vector(self.center, state.position)
-        return scale(self.impulse / (1 + dot(d, d) / self.reach**2), unit(d))
-
-    def averaged_over_step(self, t: Time, dt: Time, state: Particles) -> "_AveragedBlast":
-        """The mean in time of the force over the step from t to t + dt."""
-        return _AveragedBlast(self, acting_share(self, t, dt, state) / self.duration)
-
-    def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
-        """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole blast."""
-        return self.at, self.at + self.duration
-
-
-class _AveragedBlast(Force):
-    """A blast that lasts: so many of its impulses a second."""
-
-    blast: Blast
-    rate: Float[Array, "..."] = unchecked_quantity("blasts a second", "1/s", per="memory")
-
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        return scale(self.rate, self.blast.lane_impulse(state))
+LOWEST_REYNOLDS_NUMBER = 1e-24
+"""Re^0.681 has an infinite slope at rest; from this Reynolds number on two derivatives of it still fit in float32."""
 
 
 class StokesDrag(Force):
-    """Creeping flow past a sphere: F = -b v with b = 6πηr [kg/s], v relative to the wind [m/s].
-
-    The lecture's drag at low velocity.
+    """Drag at low velocity, creeping flow past a sphere: F = -b v with b = 6πηr [kg/s], v relative to the wind [m/s].
 
     Example:
         >>> print(forces.StokesDrag(0.5, wind=(1.0, 0.0))(0.0, ball, shot.mass))
@@ -85,23 +30,25 @@ class StokesDrag(Force):
     """
 
     dissipative_symmetric: ClassVar[bool] = True
-    coefficient: Float[Array, "..."] = quantity("drag coefficient b", "kg/s", at_least=0)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
+    coefficient: Numbers = quantity("drag coefficient b", "kg/s", at_least=0)
+    wind: OptionalNumbers = quantity("wind", "m/s", kind="vector", default=None)
 
     @classmethod
     def of_sphere(
-        cls, radius: ArrayLike, viscosity: ArrayLike = 1.81e-5, wind: ArrayLike | None = None
+        cls, radius: ArrayLike, viscosity: ArrayLike = 1.81e-5, wind: NestedArrayLike | None = None
     ) -> "StokesDrag":
-        """The drag of a sphere: b = 6πηr, radius [m], viscosity [Pa s] (air at 20 °C by default)."""
+        """The drag of a sphere: b = 6πηr, radius [m], viscosity [Pa s] (by default that of air at 20 °C)."""
         return cls(6 * math.pi * viscosity * jnp.asarray(radius), wind)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-b (v - wind) [N]."""
-        return scale(-self.coefficient, _air_velocity(state, self.wind))
+        return scale(-self.coefficient, _relative_velocity(state, self.wind))
 
 
 class QuadraticDrag(Force):
-    """Drag at high velocity: F = -½ρC_dA |v| v, v relative to the wind. The lecture prints it without its minus sign.
+    """Drag at high velocity: F = -½ρC_dA |v| v, v relative to the wind [m/s].
+
+    Area A [m²], drag coefficient C_d [1], density of the fluid ρ [kg/m³].
 
     Example:
         >>> print(forces.QuadraticDrag(area=0.2, coefficient=1.0, density=2.0)(0.0, ball, shot.mass))
@@ -109,14 +56,14 @@ class QuadraticDrag(Force):
     """
 
     dissipative_symmetric: ClassVar[bool] = True
-    area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
-    coefficient: Float[Array, "..."] = quantity("drag coefficient C_d", "1", at_least=0)
-    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
+    area: Numbers = quantity("area", "m²", at_least=0)
+    coefficient: Numbers = quantity("drag coefficient C_d", "1", at_least=0)
+    density: Numbers = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
+    wind: OptionalNumbers = quantity("wind", "m/s", kind="vector", default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-½ρC_dA |v - wind| (v - wind) [N]."""
-        v = _air_velocity(state, self.wind)
+        v = _relative_velocity(state, self.wind)
         return scale(-0.5 * self.density * self.coefficient * self.area * norm(v), v)
 
 
@@ -135,57 +82,57 @@ class SphereDrag(Force):
     """
 
     dissipative_symmetric: ClassVar[bool] = True
-    radius: Float[Array, "..."] = quantity("radius", "m", above=0)
-    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", above=0, default=1.204)
-    viscosity: Float[Array, "..."] = quantity("viscosity", "Pa s", above=0, default=1.81e-5)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
+    radius: Numbers = quantity("radius", "m", above=0)
+    density: Numbers = quantity("density of the fluid", "kg/m³", above=0, default=1.204)
+    viscosity: Numbers = quantity("viscosity", "Pa s", above=0, default=1.81e-5)
+    wind: OptionalNumbers = quantity("wind", "m/s", kind="vector", default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The corrected Stokes force [N]."""
-        v = _air_velocity(state, self.wind)
+        v = _relative_velocity(state, self.wind)
         reynolds = 2 * self.density * self.radius / self.viscosity * norm(v)
-        reynolds = jnp.maximum(reynolds, 1e-24)  # its power has no slope at 0; two derivatives still fit in float32
+        reynolds = jnp.maximum(reynolds, LOWEST_REYNOLDS_NUMBER)
         correction = 1 + 0.15 * reynolds**0.681 + (0.407 / 24) * reynolds**2 / (reynolds + 8710)
         return scale(-6 * math.pi * self.viscosity * self.radius * correction, v)
 
 
 class Magnus(Force):
-    """Lift of a spinning ball: F = ½ρAC_L |v|² ω̂×v̂, at right angles to the flight, so that it does no work.
+    """Lift of a spinning ball: F = ½ρAC_L |v|² ω̂×v̂, at right angles to the velocity, so that in still air it does no work.
 
-    `axis` is the direction of the spin, a vector in space, a number (+1 anticlockwise) in the plane; its length is left
-    out.
+    `axis` is the direction of the spin: a vector in space, a number in the plane (> 0: anticlockwise). Its magnitude does
+    not matter. Area A [m²], lift coefficient C_L [1], density of the fluid ρ [kg/m³], wind [m/s].
 
     Example:
         >>> print(forces.Magnus(area=0.2, coefficient=1.0, axis=1.0, density=2.0)(0.0, ball, shot.mass))
         [-4.  3.]
     """
 
-    area: Float[Array, "..."] = quantity("area", "m²", at_least=0)
-    coefficient: Float[Array, "..."] = quantity("lift coefficient C_L", "1", at_least=0)
-    axis: Float[Array, "..."] = quantity("spin axis", "1", kind="axial")
-    density: Float[Array, "..."] = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
-    wind: Float[Array, "..."] | None = quantity("wind", "m/s", kind="vector", default=None)
+    area: Numbers = quantity("area", "m²", at_least=0)
+    coefficient: Numbers = quantity("lift coefficient C_L", "1", at_least=0)
+    axis: Numbers = quantity("spin axis", "1", kind="axial")
+    density: Numbers = quantity("density of the fluid", "kg/m³", at_least=0, default=1.225)
+    wind: OptionalNumbers = quantity("wind", "m/s", kind="vector", default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """½ρAC_L |v| ω̂×v [N], v relative to the wind."""
-        v = _air_velocity(state, self.wind)
+        v = _relative_velocity(state, self.wind)
         axis = jnp.sign(self.axis) if v.shape[-1] == 2 else unit(broadcast_vector(self.axis, v))
         return scale(0.5 * self.density * self.coefficient * self.area * norm(v), spin(axis, v))
 
 
 class RotatingFrame(Field):
-    """What a turning frame adds: centrifugal -mω×(ω×r), Coriolis -2mω×v and, where ω changes, Euler's -mω̇×r.
+    """The inertial forces of a rotating frame: centrifugal -mω×(ω×r), Coriolis -2mω×v and, where ω changes, Euler's -mω̇×r.
 
-    `omega` [rad/s] is a vector in space, a number (anticlockwise) in the plane; `omega_rate` is its constant rate of
-    change [rad/s²]. Positions are measured from the axis, omega is given at t = 0.
+    `omega` [rad/s] at t = 0 is a vector in space, a number in the plane (> 0: anticlockwise); `omega_rate` [rad/s²] is its
+    constant rate of change. Positions are measured from the axis.
 
     Example:
         >>> print(forces.RotatingFrame(omega=1.0)(0.0, ball, shot.mass))
         [16.  8.]
     """
 
-    omega: Float[Array, "..."] = quantity("omega", "rad/s", kind="axial")
-    omega_rate: Float[Array, "..."] | None = quantity("omega_rate", "rad/s²", kind="axial", default=None)
+    omega: Numbers = quantity("omega", "rad/s", kind="axial")
+    omega_rate: OptionalNumbers = quantity("omega_rate", "rad/s²", kind="axial", default=None)
 
     def acceleration(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """-ω×(ω×r) - 2ω×v - ω̇×r [m/s²]."""
@@ -198,20 +145,20 @@ class RotatingFrame(Field):
 
 
 class Anchor(Force):
-    """A spring from a fixed point: F = -k (|d| - L) d̂ - c (v·d̂) d̂, with d = x - point.
+    """A damped spring from a fixed point: F = -k (|d| - L) d̂ - c (v·d̂) d̂, with d = x - point.
 
-    Without a rest length L it pulls in all directions alike, F = -k d - c v: the harmonic oscillator. Stiffness [N/m],
-    damping [kg/s].
+    Without a rest length L [m] it is the isotropic harmonic oscillator, F = -k d - c v. Stiffness k [N/m], damping c
+    [kg/s].
 
     Example:
         >>> print(forces.Anchor(point=(1.0, 8.0), stiffness=5.0)(0.0, ball, shot.mass))
         [  5. -10.]
     """
 
-    point: Float[Array, "..."] = quantity("anchor point", "m", kind="place")
-    stiffness: Float[Array, "..."] = quantity("stiffness", "N/m", at_least=0)
-    rest_length: Float[Array, "..."] | None = quantity("rest length", "m", at_least=0, default=None)
-    damping: Float[Array, "..."] | None = quantity("damping", "kg/s", at_least=0, default=None)
+    point: Numbers = quantity("anchor point", "m", kind="place")
+    stiffness: Numbers = quantity("stiffness", "N/m", at_least=0)
+    rest_length: OptionalNumbers = quantity("rest length", "m", at_least=0, default=None)
+    damping: OptionalNumbers = quantity("damping", "kg/s", at_least=0, default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The pull of the spring [N]."""
@@ -231,10 +178,11 @@ class Anchor(Force):
         return 0.5 * self.stiffness * (dot(d, d) if self.rest_length is None else (norm(d) - self.rest_length) ** 2)
 
 
-def independent(force: Callable) -> Function:
-    """Say of a plain function `(t, state, mass) -> newtons` that no lane's force depends on another lane.
+def independent(force: Callable[..., Array]) -> Function:
+    """A plain function `(t, state, mass) -> newtons`, declared to give each lane a force that depends on that lane alone.
 
-    The run then has a status and may have a step for each lane; a bare function counts as coupling.
+    The run then has a status, and under an adaptive method a step size, for each lane. An undeclared function counts as
+    coupling its lanes.
 
     Example:
         >>> lift = forces.independent(lambda t, state, mass: 0.5 * state.velocity)
@@ -244,11 +192,18 @@ def independent(force: Callable) -> Function:
     return Function(force, couples=False)
 
 
-def _air_velocity(state: Particles, wind: Array | None) -> Array:
-    """Velocity relative to the air."""
+def _relative_velocity(state: Particles, wind: Array | None) -> Array:
+    """Velocity relative to the air [m/s]."""
     return state.velocity if wind is None else state.velocity - broadcast_vector(wind, state.velocity)
 
 
 def _broadcast_omega(omega: Array, r: Array) -> Array:
-    """An angular velocity for every lane: a number in the plane, a vector in space."""
+    """An angular velocity per lane [rad/s]: a number in the plane, a vector in space."""
     return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else broadcast_vector(omega, r)
+
+
+__all__ = ["Anchor", "Magnus", "QuadraticDrag", "RotatingFrame", "SphereDrag", "StokesDrag", "independent"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,23 +1,22 @@
-"""Forces that follow the clock: the same at all times, for a while, or as given over time."""
+"""Forces given as functions of time: constant, a kick or a blast that lasts for a while, a table of values."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import quantity, unchecked_quantity
-from physjax.loops import Moment, Time, cast_remainder, float32_remainder, to_float_time
+from physjax.checks import Numbers, quantity, unchecked_quantity
+from physjax.loops import Time, cast_remainder, float32_remainder, to_float_time
 from physjax.particles import Particles
 from physjax.parts import Force
-from physjax.vectors import broadcast_vector, dot, scale
+from physjax.physics.forces.step_shares import acting_share, align_moment, align_with_lanes, is_acting, share_before
+from physjax.vectors import add_leading_axes, broadcast_vector, dot, scale, unit
 
 
 class Constant(Force):
-    """The same force at all times: F = F₀ [N].
+    """A constant force: F = F₀ [N], `(dim,)` or one per lane.
 
     Example:
         >>> print(forces.Constant((1.0, -2.0))(0.0, ball, shot.mass))
@@ -25,7 +24,7 @@ class Constant(Force):
     """
 
     dissipative_symmetric: ClassVar[bool] = True
-    force: Float[Array, "..."] = quantity("force", "N", kind="vector")
+    force: Numbers = quantity("force", "N", kind="vector")
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """F₀ [N]."""
@@ -37,10 +36,10 @@ class Constant(Force):
 
 
 class Kick(Force):
-    """A force for a while, as when a ball is kicked: impulse [N s] = force × duration, from the time `at` [s] on.
+    """A constant force from the time `at` [s] on for a `duration` [s]: F = impulse/duration, as when a ball is kicked.
 
-    A step feels its mean over the step, so that the whole impulse arrives under every method and at every step size.
-    A lane whose impulse is zero is not kicked.
+    `impulse` [N s] is `(dim,)` or one per lane. Steps use the mean of the force over the step, so that the whole impulse
+    arrives under every method and at every step size.
 
     Example:
         >>> kick = forces.Kick(impulse=(6.0, 0.0), at=0.0, duration=0.5)
@@ -49,10 +48,10 @@ class Kick(Force):
     """
 
     sees_moments: ClassVar[bool] = True
-    impulse: Float[Array, "..."] = quantity("impulse", "N s", kind="vector")
-    at: Float[Array, "..."] = quantity("start of the kick", "s")
-    duration: Float[Array, "..."] = quantity("duration of the kick", "s", above=0)
-    at_rest: Float[Array, "..."] | None = unchecked_quantity(
+    impulse: Numbers = quantity("impulse", "N s", kind="vector")
+    at: Numbers = quantity("start of the kick", "s")
+    duration: Numbers = quantity("duration of the kick", "s", above=0)
+    at_rest: Numbers = unchecked_quantity(
         "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
     )
 
@@ -60,28 +59,82 @@ class Kick(Force):
         self.at_rest = float32_remainder(self.at, self.at_rest)
 
     def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """impulse/duration while the kick lasts [N]."""
+        """impulse/duration while the kick lasts, else zero [N]."""
         share = jnp.where(is_acting(self, t, state), 1 / self.duration, 0.0)
         return scale(share, broadcast_vector(self.impulse, state.velocity))
 
     def averaged_over_step(self, t: Time, dt: ArrayLike, state: Particles) -> Constant:
-        """The mean of the force over the step from t to t + dt."""
+        """Its mean over the step from t to t + dt [s]."""
         share = acting_share(self, t, dt, state)
         return Constant(scale(share / self.duration, broadcast_vector(self.impulse, state.velocity)))
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
-        """Times at which the force jumps [s]; an adaptive solver must stop there, or it may step over the whole kick."""
+        """Start and end [s], at which the force jumps: an adaptive solver that does not stop there may step over it all."""
         return self.at, self.at + self.duration
 
 
-class Control(Force):
-    """A force given over time, as by an engine or a hand: `values` [N] over a `duration` [s] from the time `at` [s] on.
+class Blast(Force):
+    """An explosion: an impulse J/(1 + (d/r)²) [N s] away from the `center` at the distance d [m], spread over a `duration` [s].
 
-    `values` is `(pieces, dim)` for all lanes or `(*lanes, pieces, dim)`. The pieces are equally long and the force is
-    constant in each; with `linear=True` it runs straight from each value to the next instead, the first at the start,
-    the last at the end. Before and after there is none. Of constant pieces a step feels its mean, so that all of the
-    impulse arrives at every step size; methods keep their order where steps end at the ends of the pieces. A step reads
-    every value once (with `linear`, once a force evaluation). Raises ValueError for shapes that are none of these.
+    At the `reach` r [m] it is half of J, and far out it falls as 1/d², like a spherical wave. `impulse` J is a number, or
+    one per lane (a plate that turns its face to the blast gets more). A lane at the center itself gets none. While the
+    blast lasts, d is measured to where the lane is. As with `Kick`, steps use the mean of the force over the step.
+
+    Example:
+        >>> blast = forces.Blast(center=(0.0, 9.0), impulse=4.0, reach=1.0, at=0.0, duration=0.5)
+        >>> print(blast(0.1, ball, shot.mass))
+        [0. 4.]
+    """
+
+    sees_moments: ClassVar[bool] = True
+    center: Numbers = quantity("center of the blast", "m", kind="place")
+    impulse: Numbers = quantity("impulse", "N s")
+    reach: Numbers = quantity("reach of the blast", "m", above=0)
+    at: Numbers = quantity("start of the blast", "s")
+    duration: Numbers = quantity("duration of the blast", "s", above=0)
+    at_rest: Numbers = unchecked_quantity(
+        "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
+    )
+
+    def __post_init__(self):
+        self.at_rest = float32_remainder(self.at, self.at_rest)
+
+    def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """J/(1 + (d/r)²)/duration away from the center while the blast lasts, else zero [N]."""
+        return scale(jnp.where(is_acting(self, t, state), 1 / self.duration, 0.0), self.lane_impulse(state))
+
+    def lane_impulse(self, state: Particles) -> Float[Array, "*lanes dim"]:
+        """The impulse that each lane would get at its present place [N s]."""
+        d = state.position - broadcast_vector(self.center, state.position)
+        return scale(self.impulse / (1 + dot(d, d) / self.reach**2), unit(d))
+
+    def averaged_over_step(self, t: Time, dt: ArrayLike, state: Particles) -> Force:
+        """Its mean over the step from t to t + dt [s]; the place stays that of each stage."""
+        return _AveragedBlast(self, acting_share(self, t, dt, state) / self.duration)
+
+    def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
+        """Start and end [s], at which the force jumps."""
+        return self.at, self.at + self.duration
+
+
+class _AveragedBlast(Force):
+    """A blast during one step: a constant `rate` of its impulses [1/s], in the direction of the moment."""
+
+    blast: Blast
+    rate: Numbers = unchecked_quantity("blasts a second", "1/s", per="memory")
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        return scale(self.rate, self.blast.lane_impulse(state))
+
+
+class Control(Force):
+    """A force tabulated over time, as of an engine or a hand: `values` [N] over a `duration` [s] from the time `at` [s] on.
+
+    `values` is `(pieces, dim)` for all lanes or `(*lanes, pieces, dim)`: equally long pieces of constant force. With
+    `linear=True` the values are knots instead, the first at the start and the last at the end, joined by straight lines.
+    Before and after, the force is zero. Steps use the mean of constant pieces, so that the whole impulse arrives at every
+    step size; methods keep their order where pieces end with steps. The cost of a step grows with the number of values,
+    with `linear` once per force evaluation. Raises ValueError for other shapes.
 
     Example:
         >>> push = forces.Control([[1.0, 0.0], [3.0, 0.0]], duration=2.0)
@@ -92,10 +145,10 @@ class Control(Force):
     dissipative_symmetric: ClassVar[bool] = True
     sees_moments: ClassVar[bool] = True
     values: Float[Array, "*lanes pieces dim"] = quantity("force over time", "N", kind="vector", per="table")
-    duration: Float[Array, "..."] = quantity("duration", "s", above=0)
-    at: Float[Array, "..."] = quantity("start", "s", default=0.0)
+    duration: Numbers = quantity("duration", "s", above=0)
+    at: Numbers = quantity("start", "s", default=0.0)
     linear: bool = eqx.field(static=True, default=False)
-    at_rest: Float[Array, "..."] | None = unchecked_quantity(
+    at_rest: Numbers = unchecked_quantity(
         "rest of the start", "s", per="memory", default=None, repr=False, kw_only=True
     )
 
@@ -120,7 +173,7 @@ class Control(Force):
         return self._weighted_sum(here.astype(t.dtype), state)
 
     def averaged_over_step(self, t: Time, dt: ArrayLike, state: Particles) -> Force:
-        """The mean of the force over the step from t to t + dt; if it is linear, the force itself where the step is in it."""
+        """Its mean over the step from t to t + dt [s]; of linear pieces the force itself, times the share in which it acts."""
         t, dt = align_moment(t, dt, state)
         begins, duration, dt = jnp.broadcast_arrays(
             t.time_until_on_grid(self.at, cast_remainder(self.at, self.at_rest)), self.duration, dt
@@ -131,31 +184,34 @@ class Control(Force):
         return Constant(self._weighted_sum(before[..., 1:] - before[..., :-1], state))
 
     def discontinuities(self) -> tuple[Float[Array, "..."], ...]:
-        """Times at which the force jumps or bends [s]."""
+        """Times of the knots [s], at which the force or its slope jumps."""
         knots = self._knot_times(self.at, self.duration)
-        return (knots if knots.ndim > 1 else knots[None],)  # the same for all lanes, however many knots there are
+        # an axis in front: `(knots,)` would read as one time per lane where there are as many lanes as knots
+        return (knots if knots.ndim > 1 else knots[None],)
 
     def _knot_times(self, at: Array, duration: Array) -> Array:
-        """When the pieces begin, and when the last one ends [s], behind the axes of the lanes."""
+        """When the pieces begin, and when the last one ends [s], `(*lanes, pieces + 1)`."""
         pieces = self.values.shape[-2] - self.linear
-        shares = jnp.arange(pieces + 1, dtype=at.dtype).reshape((1,) * at.ndim + (-1,)) / pieces
+        shares = add_leading_axes(jnp.arange(pieces + 1, dtype=at.dtype), at.ndim + 1) / pieces
         return at[..., None] + duration[..., None] * shares
 
     def _align_time_and_knots(self, t: ArrayLike, state: Particles) -> tuple[Array, Array]:
+        """The time and those of the knots [s], so that they can be compared lane by lane."""
         t, at, duration = jnp.broadcast_arrays(align_with_lanes(t, state), self.at, self.duration)
         return t, self._knot_times(at, duration)
 
     def _interpolate(self, t: Time, state: Particles) -> Array:
-        """The straight line between two values; the first and the last one go on."""
+        """The value at a time on the straight lines between the knots, constant beyond the first and the last."""
         ahead = align_moment(t, 1.0, state)[0].time_until(self.at, cast_remainder(self.at, self.at_rest))
         ahead, duration = jnp.broadcast_arrays(ahead, self.duration)
         count = self.values.shape[-2]
         place = jnp.clip(-ahead / duration, 0.0, 1.0) * (count - 1)
-        numbers = jnp.arange(count, dtype=place.dtype).reshape((1,) * place.ndim + (-1,))
+        numbers = add_leading_axes(jnp.arange(count, dtype=place.dtype), place.ndim + 1)
+        # weights of all knots instead of two looked up: a gather per lane costs more than a short sum
         return self._weighted_sum(jnp.maximum(1 - jnp.abs(place[..., None] - numbers), 0.0), state)
 
     def _weighted_sum(self, weights: Array, state: Particles) -> Array:
-        """The sum of the values, each with its weight, for every lane [N]."""
+        """Σ weight·value over the pieces, per lane [N]."""
         shape = jnp.broadcast_shapes(weights.shape, self.values.shape[:-1])
         weights = jnp.broadcast_to(weights, shape)[..., None]
         values = jnp.broadcast_to(self.values, (*shape, self.values.shape[-1]))
@@ -163,54 +219,19 @@ class Control(Force):
 
 
 class _LinearControlStep(Force):
-    """A linear control as a step sees it that lies in it by a share."""
+    """A linear control in a step of which it acts for a share only: the value at each stage, times that share."""
 
     dissipative_symmetric: ClassVar[bool] = True
     sees_moments: ClassVar[bool] = True
     control: Control
-    share: Float[Array, "..."] = unchecked_quantity("share of the step", per="memory")
+    share: Numbers = unchecked_quantity("share of the step", per="memory")
 
     def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         return scale(self.share, self.control._interpolate(t, state))
 
 
-def align_with_lanes(number: ArrayLike, state: Particles) -> Array:
-    """A number that every lane has in common, or the lanes of a scene, so that it meets numbers shaped like the lanes."""
-    number = jnp.asarray(number, state.dtype)
-    return number.reshape(number.shape + (1,) * (len(state.lanes) - number.ndim)) if number.ndim else number
+__all__ = ["Blast", "Constant", "Control", "Kick"]
 
 
-def align_moment(t: Time, dt: ArrayLike, state: Particles) -> tuple[Moment, Array]:
-    """A time, and how long a step takes from there, so that they meet numbers shaped like the lanes."""
-    t = jax.tree.map(lambda number: align_with_lanes(number, state), Moment.of(t, dt, state.dtype))
-    return t, align_with_lanes(dt, state)
-
-
-def is_acting(force: Any, t: Time, state: Particles) -> Array:
-    """Whether a force acts that begins `at` a time and has a `duration`."""
-    if isinstance(t, Moment):
-        ahead = align_moment(t, 1.0, state)[0].time_until_on_grid(force.at, cast_remainder(force.at, force.at_rest))
-        return (ahead <= 0) & (ahead + force.duration > 0)
-    t = align_with_lanes(t, state)
-    return (force.at <= t) & (t < force.at + force.duration)
-
-
-def acting_share(force: Any, t: Time, dt: ArrayLike, state: Particles) -> Array:
-    """The share of the step from t to t + dt in which a force lasts that begins `at` a time and has a `duration`."""
-    t, dt = align_moment(t, dt, state)
-    begins = t.time_until_on_grid(force.at, cast_remainder(force.at, force.at_rest))
-    return share_before(begins + force.duration, dt, force.duration) - share_before(begins, dt, dt)
-
-
-def share_before(ahead: Array, dt: Array, size: Array) -> Array:
-    """The share of a step that lies before a time so far ahead of its start; exactly 0 or 1 if it is one of its ends.
-
-    The time is known to rounding of a `size` [s]. At the start of a step derivatives are those of a time within it, at
-    the end those of a time that is over: a time that is both counts once.
-    """
-    share = ahead / dt
-    whole = jnp.round(share)
-    rounding = 2 * float(jnp.finfo(share.dtype).eps) * (1 + size / dt)
-    move = jnp.where(jnp.abs(share - whole) <= rounding, whole - share, 0.0)
-    share = share + lax.stop_gradient(move)
-    return jnp.where(share < 0, 0.0, jnp.where(share < 1, share, 1.0))
+def __dir__() -> list[str]:
+    return __all__

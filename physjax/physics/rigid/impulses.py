@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from physjax.backend import any_lane, bounded_while_loop
+from physjax.linear import build_cofactors
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import RigidBodies, apply_inverse_inertia
 from physjax.vectors import cross, dot, norm
@@ -121,7 +122,8 @@ def _build_rows(points: Points, active: Array, body: _Body) -> _PointRows:
         return rows
     axes = jnp.eye(3, dtype=arm.dtype).reshape(3, 1, 3, *(1,) * (arm.ndim - 2))
     columns = jnp.stack([_apply_point_mobility(body, arm, jnp.broadcast_to(axis, arm.shape)) for axis in axes], axis=1)
-    minors = jnp.stack([_cross(columns[:, i - 2], columns[:, i - 1]) for i in range(3)], axis=1)
+    cofactors = build_cofactors([[columns[:, i, j] for j in range(3)] for i in range(3)])
+    minors = jnp.stack([jnp.stack(row, axis=1) for row in cofactors], axis=1)
     volume = _dot(columns[:, 0], minors[:, 0])
     inverse = minors / volume[:, None, None]
     leaning = _multiply(inverse, normal)

@@ -1,22 +1,24 @@
-"""Nodes with their masses and springs put together: what every rope, sheet and bridge is returned as."""
+"""Nodes, their masses and their springs in one record, as which every rope, sheet and bridge is returned."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array
 
-from physjax.checks import as_real_quantity
+from physjax.checks import NestedArrayLike, as_real_quantity
 from physjax.particles import Particles
 from physjax.physics.springs.springs import Springs
 from physjax.physics.springs.wind import Cells, Triangles, Wind
 
 
 class Lattice(NamedTuple):
-    """Nodes at rest, the mass of each [kg], the springs between them, named sets of nodes, and faces for drawing.
+    """Nodes at rest, the mass of each [kg], the springs between them, named sets of nodes, and faces to draw.
 
-    `nodes` are boolean masks by name; `faces` `(faces, 3)` are triangles of nodes. `shape` is that of a lattice, such
-    as (rows, columns); None for a mesh.
+    `nodes` are boolean masks by name, `faces` `(faces, 3)` triangles of nodes. `shape` is (rows, columns) or the like of a
+    regular lattice, None for a mesh.
 
     Example:
         >>> sheet.shape, np.flatnonzero(sheet.nodes["left"]).tolist()
@@ -24,7 +26,7 @@ class Lattice(NamedTuple):
     """
 
     state: Particles
-    mass: Any
+    mass: Array
     springs: Springs
     nodes: dict[str, np.ndarray]
     faces: np.ndarray
@@ -32,37 +34,58 @@ class Lattice(NamedTuple):
 
     def wind(
         self,
-        velocity: Any,
+        velocity: NestedArrayLike,
         density: ArrayLike = 1.225,
         normal: ArrayLike = 1.2,
         tangential: ArrayLike | None = 0.05,
     ) -> Wind:
-        """The force of the air on the faces, moving with `velocity` [m/s]; see `Wind`."""
+        """The aerodynamic force on the faces in air that moves with a `velocity` [m/s]; see `Wind`."""
         if len(self.faces) == 0 or self.state.position.shape[-1] != 3:
             raise ValueError(
                 "wind: this lattice has no faces in space to blow on; for points there is forces.QuadraticDrag."
             )
-        cells = self.shape is not None and len(self.shape) == 2
-        surface = Cells(*self.shape) if cells else Triangles(self.faces, self.state.lanes[-1])
+        if self.shape is not None and len(self.shape) == 2:
+            surface = Cells(*self.shape)
+        else:
+            surface = Triangles(self.faces, self.state.lanes[-1])
         return Wind(surface, velocity, density, normal, tangential)
 
 
-def build_lattice(x, kinds, damping, breaks_at, mass, share, sets, faces, shape, stretch=1.0) -> Lattice:
-    """The lattice of nodes at x with those kinds of springs that have a stiffness."""
+SpringKind = tuple[np.ndarray, NestedArrayLike | None]
+"""Pairs of nodes, and the stiffness of the springs between them [N/m]; None: there are none."""
+NO_FACES = np.zeros((0, 3), int)
+
+
+def build_lattice(
+    x: np.ndarray,
+    kinds: Sequence[SpringKind],
+    damping: NestedArrayLike | None,
+    breaks_at: NestedArrayLike | None,
+    mass: NestedArrayLike,
+    share: np.ndarray,
+    sets: dict[str, np.ndarray],
+    faces: np.ndarray = NO_FACES,
+    shape: tuple[int, ...] | None = None,
+    stretch: ArrayLike = 1.0,
+) -> Lattice:
+    """The lattice with nodes at x [m], and `mass` [kg] distributed to them in proportion to `share`.
+
+    Springs are as long as their ends are apart, times `stretch`.
+    """
     present = [(pairs, stiffness) for pairs, stiffness in kinds if stiffness is not None and len(pairs)]
     if not present:
         raise ValueError("lattice: got no stiffness, expected at least that of the structural springs.")
     pairs = np.concatenate([pairs for pairs, _ in present])
     rest = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]]) * stretch
     state = Particles(jnp.asarray(x, jnp.result_type(float)), jnp.zeros(x.shape, jnp.result_type(float)))
-    mass = as_real_quantity("mass [kg]", mass, above=0)
+    total = as_real_quantity("mass [kg]", mass, above=0)
     springs = Springs(pairs, _join_stiffness(present), rest, damping, breaks_at, nodes=len(x))
-    share = jnp.asarray(share / share.sum(), mass.dtype)
-    return Lattice(state, mass * share, springs, sets, faces, shape)
+    node_mass = total * jnp.asarray(share / share.sum(), total.dtype)
+    return Lattice(state, node_mass, springs, sets, faces, shape)
 
 
-def _join_stiffness(kinds: list[tuple[np.ndarray, Any]]) -> Any:
-    """The stiffness of each spring; a number alone where there is only one kind."""
+def _join_stiffness(kinds: list[tuple[np.ndarray, NestedArrayLike]]) -> Array:
+    """The stiffness of each spring [N/m]; a number as given where there is one kind, which keeps it a scalar."""
     numbers = [as_real_quantity("stiffness [N/m]", stiffness, at_least=0) for _, stiffness in kinds]
     if len(kinds) == 1:
         return numbers[0]
@@ -77,5 +100,5 @@ def _join_stiffness(kinds: list[tuple[np.ndarray, Any]]) -> Any:
 
 
 def vector_lengths(v: np.ndarray) -> np.ndarray:
-    """Lengths of vectors, the component last."""
+    """Lengths of vectors, component last."""
     return np.sqrt(np.sum(v * v, axis=-1))

@@ -1,13 +1,15 @@
-"""Linear maps that bring their own transpose, so that reverse mode is as well laid out as the map.
+"""Linear maps with a transpose of their own, so that reverse mode costs no more than the map.
 
-JAX transposes a slice into a padded array and a gather into a scatter, and then adds them all up; a map between nodes
-and springs has a transpose of slices and gathers, which it states here. Works under jit, vmap, and any derivative.
+JAX transposes a slice into a padded array and a gather into a scatter, and adds these up. A map between nodes and springs
+has a transpose made of slices and gathers as well, which is stated here. Works under jit, vmap and derivatives of any
+order in both modes, of which a `jax.custom_vjp` has the reverse one only.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
@@ -16,10 +18,13 @@ _linear_primitive = Primitive("linear_with_transpose")
 _linear_primitive.multiple_results = True
 
 
-def apply_linear(forward: Callable, backward: Callable, arrays: tuple[Array, ...]) -> list[Array]:
-    """`forward(*arrays)`, a list of arrays that depends linearly on them; `backward` is its transpose.
+def apply_linear(
+    forward: Callable[..., list[Array]], backward: Callable[..., list[Array]], arrays: Sequence[Array]
+) -> list[Array]:
+    """`forward(*arrays)`, a list of arrays that depends linearly on them, with `backward` as its transpose.
 
-    Both take any leading axes and treat them alike. Neither may close over arrays that are traced.
+    Both must accept any leading axes as batch axes, and must not close over traced arrays: they are parameters of the
+    primitive.
     """
     return _linear_primitive.bind(*arrays, forward=forward, backward=backward)
 
@@ -32,7 +37,7 @@ def _apply_forward(*arrays, forward, backward):
 @_linear_primitive.def_abstract_eval
 def _infer_shapes(*arrays, forward, backward):
     shapes = jax.eval_shape(forward, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
-    return [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
+    return [ShapedArray(s.shape, s.dtype) for s in shapes]
 
 
 def _differentiate(primals, tangents, **maps):

@@ -1,25 +1,35 @@
-"""What an implicit step sees of springs: the force near a state, with a derivative that always pushes back."""
+"""Springs linearised at a state, for implicit steps, with a Jacobian that is symmetric and negative semidefinite."""
 
-from typing import Any, ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from physjax.backend import block_fusion
 from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.physics.springs.topology import SpringTopology
 
 
-class LinearisedSprings(Force):
-    """Springs near a state: F ≈ F₀ + Σ g u + h (d·u) d + γ (d·w) d, for ends displaced by u and faster by w.
+class LinearisedSlot(NamedTuple):
+    """The springs of a slot at a state: differences of position d [m], by layout and by component, and g, h, γ."""
 
-    With g = k max(0, 1 - L/l) and h = (k - g)/l² this is the exact derivative of a stretched spring by position. A
-    compressed one would push sideways out of line (1 - L/l < 0), which may leave an implicit step without an answer;
-    here it only does not resist that (Choi and Ko 2002). γ = c/l² is the exact derivative of damping by velocity; that
-    by position, which is not symmetric, is left out. The matrix is then symmetric and never positive.
+    edge: Array
+    along: list[Array]
+    g: Array
+    h: Array
+    gamma: Array | None
+
+
+class LinearisedSprings(Force):
+    """Springs linearised at a state: F ≈ F₀ + Σ g u + h (d·u) d + γ (d·w) d, for displacements u and velocity changes w.
+
+    With g = k max(0, 1 - L/l) and h = (k - g)/l² this is the exact Jacobian of a stretched spring. The transverse
+    stiffness k (1 - L/l) of a compressed one is negative, which can make the system of an implicit step singular: it is
+    replaced by zero (K.-J. Choi, H.-S. Ko, "Stable but responsive cloth", ACM Trans. Graph. 21 (2002) 604). γ = c/l² is
+    the exact Jacobian of damping by velocity; that by position is not symmetric and is left out.
     """
 
     couples: ClassVar[bool] = True
@@ -27,28 +37,27 @@ class LinearisedSprings(Force):
     topology: SpringTopology = eqx.field(static=True)
     state: Particles
     force: Float[Array, "*scenes nodes dim"]
-    springs: list[tuple]
+    springs: list[LinearisedSlot]
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes dim"]:
         """The force [N], affine in the state."""
         topology = self.topology
         moved = [a - b for a, b in zip(state, self.state, strict=True)]
-        damped = self.springs[0][-1] is not None
+        damped = self.springs[0].gamma is not None
         parts = topology.parts(*(moved if damped else moved[:1]))
         pulls = []
-        for slot, (edge, (along, parts_along, g, h, gamma)) in enumerate(
-            zip(topology.edges(moved[0]), self.springs, strict=True)
-        ):
-            pull = h * product(parts_along, parts[0][slot])
-            if damped:
-                pull = pull + gamma * product(parts_along, parts[1][slot])
-            pull = lax.optimization_barrier(pull)
-            pulls.append(topology.neighbours.scale_edges(g, edge) + topology.neighbours.scale_edges(pull, along))
+        for slot, (edge, at) in enumerate(zip(topology.edges(moved[0]), self.springs, strict=True)):
+            pull = at.h * product(at.along, parts[0][slot])
+            if at.gamma is not None:
+                pull = pull + at.gamma * product(at.along, parts[1][slot])
+            # materialised: every component of the force reads it
+            pull = block_fusion(pull)
+            pulls.append(topology.neighbours.scale_edges(at.g, edge) + topology.neighbours.scale_edges(pull, at.edge))
         return self.force + topology.resultant(pulls)
 
 
-def product(a: list[Array], b: list[Array]) -> Any:
-    """a·b from lists of components."""
+def product(a: list[Array], b: list[Array]) -> Array:
+    """a·b of vectors given as lists of components."""
     total = a[0] * b[0]
     for p, q in zip(a[1:], b[1:], strict=True):
         total = total + p * q
@@ -56,6 +65,6 @@ def product(a: list[Array], b: list[Array]) -> Any:
 
 
 def spring_jacobian_coefficients(k: Array, ratio: Array, square: Array) -> tuple[Array, Array]:
-    """g and h of a spring of stiffness k [N/m], from L/l and l²."""
+    """g and h of `LinearisedSprings`, of springs of stiffness k [N/m], from the ratio L/l and the square l² [m²]."""
     g = k * jnp.maximum(1 - ratio, 0.0)
     return g, (k - g) / square

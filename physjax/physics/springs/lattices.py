@@ -1,24 +1,23 @@
-"""Nodes and springs in good order: rope, cloth, jelly, bridge, and whatever a mesh describes.
+"""Lattices of nodes and springs: rope, cloth, jelly, bridge, and the edges of a mesh.
 
-Each returns a `Lattice` at rest. Stiffness [N/m] and damping [kg/s] are those of a single spring; springs whose
-stiffness is None are absent. `mass` [kg] is that of the whole, and each node has its share of length, area or volume.
+Each function returns a `Lattice` at rest. Stiffness [N/m] and damping [kg/s] are those of a single spring; a stiffness of
+None leaves that kind of spring out. `mass` [kg] is the total, distributed to the nodes by length, area or volume.
 """
 
 from collections.abc import Iterable, Sequence
 from itertools import product
-from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.checks import NestedArrayLike, as_positive_integer, as_real_quantity
 from physjax.physics.springs.assembly import Lattice, build_lattice, vector_lengths
 from physjax.physics.springs.mesh_sheets import from_mesh
 
 
 def rope(
-    start: Any,
-    end: Any,
+    start: NestedArrayLike,
+    end: NestedArrayLike,
     nodes: int,
     *,
     mass: ArrayLike,
@@ -28,9 +27,10 @@ def rope(
     length: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
 ) -> Lattice:
-    """A rope from `start` to `end` [m], in the plane or in space, with its nodes at equal distances.
+    """A rope from `start` to `end` [m], in the plane or in space, with equally spaced nodes.
 
-    It is as long as the way unless `length` [m] says otherwise; a longer one begins slack. Sets: start, end, ends.
+    Its unstretched `length` [m] is by default the distance of its ends; a longer rope begins slack. Sets of nodes: start,
+    end, ends.
 
     Example:
         >>> rope = lattices.rope((0.0, 0.0), (4.0, 0.0), nodes=5, mass=1.0, stiffness=100.0)
@@ -41,16 +41,16 @@ def rope(
     ends = [np.asarray(as_real_quantity(name, value)) for name, value in (("start [m]", start), ("end [m]", end))]
     if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
         raise ValueError(f"rope: got start {ends[0].shape} and end {ends[1].shape}, expected two points (2,) or (3,).")
-    x = np.linspace(*ends, nodes)
-    way = vector_lengths(ends[1] - ends[0])
-    stretch = 1.0 if length is None else as_real_quantity("length [m]", length, above=0) / way
+    x = np.linspace(ends[0], ends[1], nodes)
+    distance = vector_lengths(ends[1] - ends[0])
+    stretch = 1.0 if length is None else as_real_quantity("length [m]", length, above=0) / distance
     kinds = [(_pair_nodes((nodes,), [(1,)]), stiffness), (_pair_nodes((nodes,), [(2,)]), bend)]
     share = np.ones(nodes)
     share[[0, -1]] = 0.5
     index = np.arange(nodes)
     sets = {"start": index == 0, "end": index == nodes - 1}
     sets["ends"] = sets["start"] | sets["end"]
-    return build_lattice(x, kinds, damping, breaks_at, mass, share, sets, np.zeros((0, 3), int), (nodes,), stretch)
+    return build_lattice(x, kinds, damping, breaks_at, mass, share, sets, shape=(nodes,), stretch=stretch)
 
 
 def cloth(
@@ -65,15 +65,15 @@ def cloth(
     bend: ArrayLike | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
-    corner: Any = (0.0, 0.0, 0.0),
-    across: Any = (1.0, 0.0, 0.0),
-    down: Any = (0.0, -1.0, 0.0),
+    corner: NestedArrayLike = (0.0, 0.0, 0.0),
+    across: NestedArrayLike = (1.0, 0.0, 0.0),
+    down: NestedArrayLike = (0.0, -1.0, 0.0),
 ) -> Lattice:
     """A sheet of `width` × `height` [m], `rows` × `columns` nodes: node (i, j) is number i·columns + j.
 
-    Structural springs tie neighbours, shear springs the diagonals, bend springs every other node. The upper left
-    `corner` [m] is node 0; rows run `across`, columns `down`: with down=(0, 0, 1) it lies instead of hanging. Sets: top,
-    bottom, left, right, edge, corners, top_left, top_right, bottom_left, bottom_right.
+    Structural springs join neighbours, shear springs the diagonals of cells, bend springs every second node. Node 0 is
+    the upper left `corner` [m]; rows run `across` and columns `down` (with down=(0, 0, 1) the sheet is level). Sets of
+    nodes: top, bottom, left, right, edge, corners, top_left, top_right, bottom_left, bottom_right.
 
     Example:
         >>> sail = lattices.cloth(2.0, 1.0, rows=2, columns=3, mass=0.6, structural=100.0, shear=50.0)
@@ -82,18 +82,9 @@ def cloth(
     """
     rows, columns = as_positive_integer("rows", rows, at_least=2), as_positive_integer("columns", columns, at_least=2)
     lengths = [float(as_real_quantity(f"{n} [m]", v, above=0)) for n, v in (("width", width), ("height", height))]
-    across, down, corner = (
-        np.asarray(as_real_quantity(n, v)) for n, v in (("across", across), ("down", down), ("corner", corner))
-    )
-    if {across.shape, down.shape, corner.shape} != {(3,)}:
-        raise ValueError(
-            f"cloth: got across {across.shape}, down {down.shape} and corner {corner.shape}, expected vectors (3,)."
-        )
-    if vector_lengths(np.cross(across, down)) == 0:
-        raise ValueError(f"cloth: got across {across} and down {down}, expected two different directions.")
+    origin, right, below = _check_sheet_frame(corner, across, down)
     i, j = (a.ravel() for a in np.indices((rows, columns)))
-    right, below = (a / vector_lengths(a) for a in (across, down))
-    x = corner + np.multiply.outer(j * lengths[0] / (columns - 1), right)
+    x = origin + np.multiply.outer(j * lengths[0] / (columns - 1), right)
     x = x + np.multiply.outer(i * lengths[1] / (rows - 1), below)
     shape = (rows, columns)
     kinds = [
@@ -105,17 +96,24 @@ def cloth(
     sets |= {f"{a}_{b}": sets[a] & sets[b] for a in ("top", "bottom") for b in ("left", "right")}
     sets["edge"] = sets["top"] | sets["bottom"] | sets["left"] | sets["right"]
     sets["corners"] = (sets["top"] | sets["bottom"]) & (sets["left"] | sets["right"])
-    return build_lattice(
-        x,
-        kinds,
-        damping,
-        breaks_at,
-        mass,
-        _compute_node_shares(shape),
-        sets,
-        _triangulate_cells(np.arange(i.size).reshape(shape)),
-        shape,
+    faces = _triangulate_cells(np.arange(i.size).reshape(shape))
+    return build_lattice(x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape)
+
+
+def _check_sheet_frame(
+    corner: NestedArrayLike, across: NestedArrayLike, down: NestedArrayLike
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The corner of a sheet [m] and the unit vectors along its rows and columns, or a ValueError."""
+    corner, across, down = (
+        np.asarray(as_real_quantity(n, v)) for n, v in (("corner", corner), ("across", across), ("down", down))
     )
+    if {across.shape, down.shape, corner.shape} != {(3,)}:
+        raise ValueError(
+            f"cloth: got across {across.shape}, down {down.shape} and corner {corner.shape}, expected vectors (3,)."
+        )
+    if vector_lengths(np.cross(across, down)) == 0:
+        raise ValueError(f"cloth: got across {across} and down {down}, expected two different directions.")
+    return corner, across / vector_lengths(across), down / vector_lengths(down)
 
 
 def jelly(
@@ -128,12 +126,12 @@ def jelly(
     bend: ArrayLike | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
-    corner: Any = (0.0, 0.0, 0.0),
+    corner: NestedArrayLike = (0.0, 0.0, 0.0),
 ) -> Lattice:
-    """A block of `size` (x, y, z) [m] with so many `nodes` along each side, its lowest corner at `corner` [m].
+    """A block of `size` (x, y, z) [m] with `nodes` (n_x, n_y, n_z) along its sides, its lowest corner at `corner` [m].
 
-    Structural springs tie neighbours, shear springs the diagonals of faces and of the cells, bend springs every other
-    node. Sets: left and right (x), bottom and top (y), back and front (z), surface, corners.
+    Structural springs join neighbours, shear springs the diagonals of faces and cells, bend springs every second node.
+    Sets of nodes: left and right (x), bottom and top (y), back and front (z), surface, corners.
 
     Example:
         >>> cube = lattices.jelly((1.0, 1.0, 1.0), (2, 2, 2), mass=1.0, structural=100.0)
@@ -141,14 +139,12 @@ def jelly(
         (8, 12)
     """
     shape = tuple(as_positive_integer("nodes", n, at_least=2) for n in nodes)
-    lengths, corner = (
-        np.asarray(as_real_quantity("size [m]", size, above=0)),
-        np.asarray(as_real_quantity("corner [m]", corner)),
-    )
-    if (len(shape), lengths.shape, corner.shape) != (3, (3,), (3,)):
+    lengths = np.asarray(as_real_quantity("size [m]", size, above=0))
+    origin = np.asarray(as_real_quantity("corner [m]", corner))
+    if (len(shape), lengths.shape, origin.shape) != (3, (3,), (3,)):
         raise ValueError(f"jelly: got {len(shape)} counts of nodes and size {lengths.shape}, expected three of each.")
     place = np.indices(shape).reshape(3, -1).T
-    x = corner + place * (lengths / (np.array(shape) - 1))
+    x = origin + place * (lengths / (np.array(shape) - 1))
     steps = [s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 0)]
     straight = [s for s in steps if sum(map(abs, s)) == 1]
     kinds = [
@@ -156,19 +152,22 @@ def jelly(
         (_pair_nodes(shape, [s for s in steps if s not in straight]), shear),
         (_pair_nodes(shape, [tuple(2 * a for a in s) for s in straight]), bend),
     ]
-    last = place == np.array(shape) - 1
-    sides = [(place == 0)[:, a] if end == 0 else last[:, a] for a in range(3) for end in (0, 1)]
+    first, last = place == 0, place == np.array(shape) - 1
+    sides = [end[:, axis] for axis in range(3) for end in (first, last)]
     sets = dict(zip(("left", "right", "bottom", "top", "back", "front"), sides, strict=True))
-    at_end = (place == 0) | last
-    sets |= {"surface": at_end.any(axis=1), "corners": at_end.all(axis=1)}
-    number = np.arange(len(x)).reshape(shape)
-    skin = []
-    for axis in range(3):  # outward on both sides
+    sets |= {"surface": (first | last).any(axis=1), "corners": (first | last).all(axis=1)}
+    faces = _triangulate_surface(shape)
+    return build_lattice(x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape)
+
+
+def _triangulate_surface(shape: tuple[int, ...]) -> np.ndarray:
+    """Triangles of the six faces of a block of nodes, their normals outward."""
+    number, faces = np.arange(np.prod(shape)).reshape(shape), []
+    for axis in range(3):
         low, high = np.take(number, 0, axis), np.take(number, -1, axis)
-        skin += [_triangulate_cells(low if axis == 1 else low.T), _triangulate_cells(high.T if axis == 1 else high)]
-    return build_lattice(
-        x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, np.concatenate(skin), shape
-    )
+        # the axes that are left are (y, z), (x, z), (x, y): for the middle pair x × z points down, else up
+        faces += [_triangulate_cells(low if axis == 1 else low.T), _triangulate_cells(high.T if axis == 1 else high)]
+    return np.concatenate(faces)
 
 
 def bridge(
@@ -182,11 +181,11 @@ def bridge(
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
 ) -> Lattice:
-    """A truss over a `span` [m] along x: two chords, posts, and both diagonals in every panel; rigid when pinned at one end.
+    """A truss bridge of a `span` [m] along x: two chords, posts, and both diagonals in every panel.
 
-    With a `width` [m] there are two such trusses side by side, z = 0 and z = width, braced to each other above and
-    below. Mass goes with the length of the beams. Sets: deck (the lower chord), top, left, right, supports (the ends of
-    the deck).
+    With a `width` [m] there are two such trusses, at z = 0 and z = width, braced to each other at top and bottom. Mass is
+    proportional to the length of the beams. Sets of nodes: deck (the lower chord), top, left, right, supports (the ends
+    of the deck).
 
     Example:
         >>> truss = lattices.bridge(4.0, 1.0, panels=4, mass=100.0, stiffness=2e4)
@@ -199,18 +198,18 @@ def bridge(
     shape = (panels + 1, *[2] * (len(sides) - 1))
     place = np.indices(shape).reshape(len(shape), -1).T
     x = place * (lengths / (np.array(shape) - 1))
-    steps = [s for s in product((-1, 0, 1), repeat=len(shape)) if s > (0,) * len(shape)]
+    steps = [s for s in product((-1, 0, 1), repeat=len(shape)) if s > (0,) * len(shape)]  # each direction once
     flat = [s for s in steps if sum(map(abs, s)) <= 2]  # along the edges and across the faces of each box
     pairs = _pair_nodes(shape, flat)
     along = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]])
     share = np.bincount(pairs.ravel(), np.repeat(along, 2), len(x))
     sets = {"left": place[:, 0] == 0, "right": place[:, 0] == panels, "deck": place[:, 1] == 0, "top": place[:, 1] == 1}
     sets["supports"] = sets["deck"] & (sets["left"] | sets["right"])
-    return build_lattice(x, [(pairs, stiffness)], damping, breaks_at, mass, share, sets, np.zeros((0, 3), int), shape)
+    return build_lattice(x, [(pairs, stiffness)], damping, breaks_at, mass, share, sets, shape=shape)
 
 
 def _pair_nodes(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.ndarray:
-    """Pairs of all nodes of a lattice that are the given steps apart."""
+    """All pairs of nodes of a lattice that are one of the given steps apart."""
     number, pairs = np.arange(np.prod(shape)).reshape(shape), []
     for step in steps:
         here = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shape, strict=True))
@@ -221,7 +220,7 @@ def _pair_nodes(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.
 
 
 def _compute_node_shares(shape: tuple[int, ...]) -> np.ndarray:
-    """Each node's share of a lattice: half as much at the end of a row, in every direction."""
+    """Each node's share of the volume of a lattice: halved at the ends of every axis."""
     share = np.ones(1)
     for count in shape:
         ends = np.ones(count)
@@ -231,7 +230,7 @@ def _compute_node_shares(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _triangulate_cells(number: np.ndarray) -> np.ndarray:
-    """Two triangles for each cell of a sheet of nodes."""
+    """Two triangles for each cell of a sheet of nodes `(rows, columns)`."""
     a, b, c, d = (number[i : i - 1 or None, j : j - 1 or None].ravel() for i in (0, 1) for j in (0, 1))
     return np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
 

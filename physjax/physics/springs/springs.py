@@ -1,30 +1,31 @@
-"""Springs between nodes: ropes, cloth, jelly and bridges are nothing else."""
+"""Damped springs between pairs of nodes, of which ropes, cloth, jelly and bridges are made."""
 
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import as_positive_integer, as_real_quantity, unchecked_quantity
+from physjax.backend import block_fusion
+from physjax.checks import NestedArrayLike, as_positive_integer, as_real_quantity, unchecked_quantity
 from physjax.particles import Particles
 from physjax.parts import Force
-from physjax.physics.springs.jacobian import LinearisedSprings, product, spring_jacobian_coefficients
+from physjax.physics.springs.jacobian import LinearisedSlot, LinearisedSprings, product, spring_jacobian_coefficients
 from physjax.physics.springs.topology import SpringTopology
-from physjax.vectors import dot, norm, square_root, unit
+from physjax.vectors import add_leading_axes, dot, norm, square_root, unit
 
 
 class Springs(Force):
-    """Springs between pairs of nodes: F = -(k (l - L) + c l̇) along the line, on both ends, equal and opposite.
+    """Damped springs between pairs of nodes: F = -(k (l - L) + c l̇) along the line between the ends, equal and opposite.
 
     `pairs` `(springs, 2)` are indices into the last lane axis. Stiffness k [N/m], rest length L [m] and damping c
-    [kg/s] are numbers for all springs or one each, `(springs,)`; behind leading axes of scenes they are swept. Ends
-    that meet have no line and are not pushed apart. With `breaks_at` a spring parts for good beyond that strain
-    (l - L)/L; a run then keeps what is `intact`. `nodes` is the number of nodes, if more than the pairs name. `layout`
-    is "bands" (shifted slices, for lattices) or "gather" (for meshes), chosen if not given. Raises ValueError or
-    TypeError for pairs that are not pairs of different nodes, numbers < 0 and shapes that do not match.
+    [kg/s] are numbers for all springs or one each, `(springs,)`; leading axes of scenes make a sweep of them. Coinciding
+    ends have no line between them and no force. With `breaks_at`, a strain (l - L)/L, a spring that is stretched beyond it
+    breaks for good, and a run records which are `unbroken`. `nodes` is the number of nodes, if the pairs do not name the
+    last. `layout` is "bands" (shifted slices, for lattices) or "gather" (for meshes), by default the faster. Raises
+    ValueError or TypeError for pairs that are not pairs of different nodes, numbers < 0 and shapes that do not match.
 
     Example:
         >>> ends = Particles(jnp.array([[0.0, 0.0], [1.5, 0.0]]), jnp.zeros((2, 2)))
@@ -44,11 +45,11 @@ class Springs(Force):
 
     def __init__(
         self,
-        pairs: Any,
-        stiffness: Any,
-        rest_length: Any,
-        damping: Any = None,
-        breaks_at: Any = None,
+        pairs: NestedArrayLike,
+        stiffness: NestedArrayLike,
+        rest_length: NestedArrayLike,
+        damping: NestedArrayLike | None = None,
+        breaks_at: NestedArrayLike | None = None,
         *,
         nodes: int | None = None,
         layout: str | None = None,
@@ -59,12 +60,12 @@ class Springs(Force):
         self.c = None if damping is None else self._lay_out("damping [kg/s]", damping)
         self.limit = None if breaks_at is None else self._lay_out("breaks_at [1]", breaks_at)
         self.intact = None
-        if breaks_at is not None:
+        if self.limit is not None:
             scenes = jnp.broadcast_shapes(*(a.shape[:-2] for a in (self.k, self.L, self.limit)))
             self.intact = jnp.broadcast_to(self.topology.present, (*scenes, *self.topology.present.shape))
 
     @property
-    def pairs(self) -> Any:
+    def pairs(self) -> np.ndarray:
         """The two nodes of each spring, `(springs, 2)`."""
         return self.topology.pairs
 
@@ -75,12 +76,12 @@ class Springs(Force):
 
     @property
     def layout(self) -> str:
-        """How neighbours are found: "bands" or "gather"."""
+        """How neighbours are read: "bands" or "gather"."""
         return self.topology.layout
 
     @property
     def stiffness(self) -> Float[Array, "..."]:
-        """k [N/m], as given: for all springs or one each. Of a gradient: the derivative by it."""
+        """k [N/m], as given: for all springs or one each. In a gradient, the derivative by it."""
         return self.topology.collect(self.k)
 
     @property
@@ -95,70 +96,68 @@ class Springs(Force):
 
     @property
     def breaks_at(self) -> Float[Array, "..."] | None:
-        """The strain beyond which a spring parts, as given."""
+        """The strain beyond which a spring breaks [1], as given."""
         return None if self.limit is None else self.topology.collect(self.limit)
 
     @property
     def unbroken(self) -> Bool[Array, "*scenes springs"] | None:
-        """Which springs still hold; None for springs that cannot break."""
+        """Which springs are unbroken; None for springs that cannot break."""
         return None if self.intact is None else self.topology.collect(self.intact)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes dim"]:
         """Σ (k (1 - L/l) + c (d·ḋ)/l²) d over the springs of each node, d to the other end [N]."""
         self._demand_nodes(state)
-        topology, damped = self.topology, self.c is not None
-        parts = topology.parts(*(state if damped else state[:1]))
+        topology, c = self.topology, self.c
+        parts = topology.parts(*(state[:1] if c is None else state))
         pulls = []
         for slot, (edge, d) in enumerate(zip(topology.edges(state.position), parts[0], strict=True)):
             k, L = self._take_slot(slot, self.k, d), self._take_slot(slot, self.L, d)
             square = product(d, d)
-            apart = jnp.where(square > 0, square, 1.0)
+            apart = jnp.where(square > 0, square, 1.0)  # ends that coincide: no division by 0, also in derivatives
+            # (k (1 - L/l) + c (d·ḋ)/l²) l², so that one division by l² remains
             pull = k * (apart - L * square_root(square))
-            if damped:
-                pull = pull + self._take_slot(slot, self.c, d) * product(d, parts[1][slot])
-            # kept apart, or it would be computed anew for every component and both ends; a division at the end is what
-            # older compilers keep apart by themselves
-            weight = lax.optimization_barrier(
-                jnp.where(self._take_slot(slot, self._unbroken_slots, d), pull, 0.0) / apart
-            )
+            if c is not None:
+                pull = pull + self._take_slot(slot, c, d) * product(d, parts[1][slot])
+            # materialised, or XLA would compute it again for every component and both ends; the division comes last
+            # because older compilers materialise a division by themselves
+            weight = block_fusion(jnp.where(self._take_unbroken(slot, d), pull, 0.0) / apart)
             pulls.append(topology.neighbours.scale_edges(weight, edge))
         return topology.resultant(pulls)
 
     def linearised_at(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> LinearisedSprings:
-        """The springs near a state, with a derivative that always pushes back: what an implicit step sees of them."""
+        """The springs linearised at a state, with a negative semidefinite Jacobian, as an implicit step uses them."""
         springs = []
         x = state.position
         for slot, (edge, d) in enumerate(zip(self.topology.edges(x), self.topology.parts(x)[0], strict=True)):
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
-            holding = self._take_slot(slot, self._unbroken_slots, d)
-            k = jnp.where(holding, self._take_slot(slot, self.k, d), 0.0)
+            unbroken = self._take_unbroken(slot, d)
+            k = jnp.where(unbroken, self._take_slot(slot, self.k, d), 0.0)
             g, h = spring_jacobian_coefficients(
                 k, self._take_slot(slot, self.L, d) * square_root(square) / apart, apart
             )
-            gamma = None if self.c is None else jnp.where(holding, self._take_slot(slot, self.c, d), 0.0) / apart
-            springs.append((edge, d, g, h, gamma))
+            gamma = None if self.c is None else jnp.where(unbroken, self._take_slot(slot, self.c, d), 0.0) / apart
+            springs.append(LinearisedSlot(edge, d, g, h, gamma))
         return LinearisedSprings(self.topology, state, self(t, state, mass), springs)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
-        """½k(l - L)² [J], halved between the two ends."""
+        """½k(l - L)² [J], half of it at each end."""
         self._demand_nodes(state)
         energies = []
         for slot, d in enumerate(self.topology.parts(state.position)[0]):
             stretch = square_root(product(d, d)) - self._take_slot(slot, self.L, d)
             energy = 0.25 * self._take_slot(slot, self.k, d) * stretch * stretch
-            energies.append(jnp.where(self._take_slot(slot, self._unbroken_slots, d), energy, 0.0))
+            energies.append(jnp.where(self._take_unbroken(slot, d), energy, 0.0))
         return self.topology.neighbours.sum_at_both_ends(energies)
 
     @property
-    def remembers(self) -> bool:
-        """Whether springs can break."""
-        return self.limit is not None
-
-    def advance(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
-        """The springs without those that are stretched beyond `breaks_at`; they stay broken."""
+    def advance(self) -> Any:
+        """`advance(t, dt, state) -> (springs, state)` parts the springs that are overstretched; only if they can break."""
         if self.limit is None:
-            return self, state
+            raise AttributeError("springs without breaks_at remember nothing")
+        return self._break_overstretched
+
+    def _break_overstretched(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
         self._demand_nodes(state)
         held = []
         for slot, d in enumerate(self.topology.parts(state.position)[0]):
@@ -178,51 +177,54 @@ class Springs(Force):
         return norm(self._edge_vectors(state.position))
 
     def strain(self, state: Particles) -> Float[Array, "*scenes springs"]:
-        """(l - L)/L of each spring; infinite for a spring without rest length."""
+        """Strain (l - L)/L of each spring [1]; infinite for a spring of zero rest length."""
         length = self.length(state)
-        return (length - self._align_axes(self.rest_length, length)) / self._align_axes(self.rest_length, length)
+        rest_length = add_leading_axes(self.rest_length, length.ndim)
+        return (length - rest_length) / rest_length
 
     def tension(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """k (l - L) + c l̇ of each spring [N]: positive when it pulls, zero when it is broken."""
         length = self.length(state)
-        tension = self._align_axes(self.stiffness, length) * (length - self._align_axes(self.rest_length, length))
-        if self.c is not None:
+        stiffness, rest_length = (add_leading_axes(n, length.ndim) for n in (self.stiffness, self.rest_length))
+        tension = stiffness * (length - rest_length)
+        if self.damping is not None:
             rate = dot(unit(self._edge_vectors(state.position)), self._edge_vectors(state.velocity))
-            tension = tension + self._align_axes(self.damping, length) * rate
+            tension = tension + add_leading_axes(self.damping, length.ndim) * rate
         return self._zero_broken(tension)
 
     def energy(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """½k(l - L)² of each spring [J], zero when it is broken."""
         length = self.length(state)
-        stretch = length - self._align_axes(self.rest_length, length)
-        return self._zero_broken(0.5 * self._align_axes(self.stiffness, length) * stretch * stretch)
+        stretch = length - add_leading_axes(self.rest_length, length.ndim)
+        return self._zero_broken(0.5 * add_leading_axes(self.stiffness, length.ndim) * stretch * stretch)
 
-    @property
-    def _unbroken_slots(self) -> Any:
-        """The slots in which a spring holds."""
-        return self.topology.present if self.intact is None else self.intact
+    def _take_unbroken(self, slot: int, like: list[Array]) -> Array | np.ndarray:
+        """Mask of the unbroken springs of a slot, with as many axes as the components `like`."""
+        if self.intact is not None:
+            return self._take_slot(slot, self.intact, like)
+        present = self.topology.neighbours.at(self.topology.present, slot)  # NumPy's: a constant of the program
+        return add_leading_axes(present, like[0].ndim)
 
-    def _take_slot(self, slot: int, number: Any, like: list[Array]) -> Any:
-        """A number of the springs in a slot, `()` or with the axes of the scenes and of the slot."""
+    def _take_slot(self, slot: int, number: Array, like: list[Array]) -> Array:
+        """A number of the springs in a slot, `()` or with as many axes as the components `like` it is combined with."""
         if number.ndim == 0:
             return number
         each = number.shape[-2:] == self.topology.present.shape
         number = self.topology.neighbours.at(number, slot) if each else number[..., 0, :]
-        return number.reshape((1,) * (like[0].ndim - number.ndim) + number.shape)
-
-    def _align_axes(self, number: Array, like: Array) -> Array:
-        """A number as given, with the axes of the scenes and springs."""
-        return number.reshape((1,) * (like.ndim - number.ndim) + number.shape) if number.ndim else number
+        return add_leading_axes(number, like[0].ndim)
 
     def _zero_broken(self, number: Array) -> Array:
-        return number if self.intact is None else number * self._align_axes(self.unbroken, number).astype(number.dtype)
+        """A number per spring, zero where a spring is broken."""
+        unbroken = self.unbroken
+        return number if unbroken is None else number * add_leading_axes(unbroken, number.ndim).astype(number.dtype)
 
     def _edge_vectors(self, a: Array) -> Array:
+        """The vector at the second end of each spring minus that at the first, `(*scenes, springs, dim)`."""
         first, second = self.topology.ends(a)
         return second - first
 
-    def _lay_out(self, name: str, value: Any) -> Array:
-        """A checked number of the springs, laid out."""
+    def _lay_out(self, name: str, value: NestedArrayLike) -> Array:
+        """A number per spring or for all, checked, in slots."""
         number = as_real_quantity(name, value, at_least=0)
         springs = len(self.topology.pairs)
         if number.ndim and number.shape[-1] != springs and (number.ndim == 1 or number.shape[-1] != 1):
@@ -233,6 +235,7 @@ class Springs(Force):
         return self.topology.spread(number)
 
     def _demand_nodes(self, state: Particles) -> None:
+        """Raise a ValueError for a state with another number of nodes."""
         if state.lanes[-1:] != (self.nodes,):
             raise ValueError(
                 f"Springs: got positions of shape {state.position.shape}, expected (*scenes, {self.nodes}, dim): the "

@@ -1,33 +1,32 @@
-"""Air on the faces of a sheet: what makes a flag fly."""
+"""The aerodynamic force of the wind on the faces of a sheet."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import materialise
-from physjax.checks import quantity
-from physjax.particles import Particles
+from physjax.backend import block_fusion, materialise
+from physjax.checks import Numbers, OptionalNumbers, quantity
+from physjax.particles import Particles, sum_terms
 from physjax.parts import Force
-from physjax.physics.springs.topology import rank_in_group, take
+from physjax.physics.springs.neighbours import rank_in_group, take
 from physjax.vectors import broadcast_vector, cross, dot, norm, scale, unit
 
 
 class Cells:
-    """The cells of a sheet of rows × columns nodes, found by shifted slices; their four corners carry a quarter each.
+    """The cells of a sheet of rows × columns nodes, by shifted slices; each of the four corners gets a quarter of a force.
 
-    The sheet is thought to go on for one more row and column on every side, folded up to nothing, so that every node
-    has four cells; those without area feel nothing.
+    The sheet is continued by one row and column on every side that coincide with its edge: every node then has four
+    cells, and those without area have no force.
     """
 
     def __init__(self, rows: int, columns: int):
         self.rows, self.columns = rows, columns
 
-    def __eq__(self, other: Any) -> bool:
+    def __eq__(self, other: object) -> bool:
         return isinstance(other, Cells) and (self.rows, self.columns) == (other.rows, other.columns)
 
     def __hash__(self) -> int:
@@ -45,21 +44,24 @@ class Cells:
         return 0.5 * cross(d - a, b - c), 0.25 * (p + q + r + s)
 
     def sum_at_nodes(self, newtons: Array) -> Array:
-        """The cells' forces shared among their corners, `(*scenes, nodes, 3)`."""
-        total = 0.25 * sum(self._slice_shifted(newtons, self.rows, self.columns))
+        """The forces of the cells [N] distributed to their corners, `(*scenes, nodes, 3)`."""
+        total = 0.25 * sum_terms(self._slice_shifted(newtons, self.rows, self.columns))
         return total.reshape((*newtons.shape[:-3], self.nodes, newtons.shape[-1]))
 
-    def _take_corners(self, a):
+    def _take_corners(self, a: Array) -> list[Array]:
+        """The vectors at the four corners of each cell: upper left, upper right, lower left, lower right."""
         sheet = a.reshape((*a.shape[:-2], self.rows, self.columns, a.shape[-1]))
         wide = jnp.pad(sheet, [(0, 0)] * (sheet.ndim - 3) + [(1, 1), (1, 1), (0, 0)], mode="edge")
-        return self._slice_shifted(lax.optimization_barrier(wide), self.rows + 1, self.columns + 1)
+        # four slices of one array in memory; fused, the padding would be computed four times
+        return self._slice_shifted(block_fusion(wide), self.rows + 1, self.columns + 1)
 
-    def _slice_shifted(self, a, rows, columns):
+    def _slice_shifted(self, a: Array, rows: int, columns: int) -> list[Array]:
+        """The four windows of a size in a sheet, shifted by one row and one column."""
         return [a[..., i : i + rows, j : j + columns, :] for i in (0, 1) for j in (0, 1)]
 
 
 class Triangles:
-    """The triangles of a mesh, found by gathering; their corners carry a third each. Compared by content."""
+    """The triangles of a mesh, by gathering; each corner gets a third of a force. Compared by content."""
 
     def __init__(self, faces: np.ndarray, nodes: int):
         self.corners, self.nodes = faces.astype(np.int32), nodes
@@ -68,7 +70,7 @@ class Triangles:
         self.node_faces[place, self.corners.ravel()] = np.repeat(np.arange(len(faces)), 3)
         self._hash = hash((nodes, self.corners.tobytes()))
 
-    def __eq__(self, other: Any) -> bool:
+    def __eq__(self, other: object) -> bool:
         return self is other or (
             isinstance(other, Triangles) and self.nodes == other.nodes and np.array_equal(self.corners, other.corners)
         )
@@ -83,45 +85,44 @@ class Triangles:
         return 0.5 * cross(b - a, c - a), (p + q + r) / 3
 
     def sum_at_nodes(self, newtons: Array) -> Array:
-        """The triangles' forces shared among their corners, `(*scenes, nodes, 3)`."""
+        """The forces of the triangles [N] distributed to their corners, `(*scenes, nodes, 3)`."""
+        # gathered by node instead of scattered by face: row `len(faces)` is the zero for nodes with fewer faces
         shares = jnp.concatenate([newtons / 3, jnp.zeros_like(newtons[..., :1, :])], axis=-2)
-        return sum(take(shares, faces) for faces in self.node_faces)
+        return sum_terms([take(shares, faces) for faces in self.node_faces])
 
 
 class Wind(Force):
-    """Air on a sheet: F = ½ρA (C_n |u·n| (u·n) n + C_t |u| u_t) on each face of area A, shared among its corners.
+    """Wind on a sheet: F = ½ρA (C_n |u·n| (u·n) n + C_t |u| u_t) on each face of area A, distributed to its corners.
 
-    u is the air's velocity relative to the face, u·n its part along the face's normal, u_t what is left. `velocity`
-    [m/s] is that of the air, `(3,)`; `density` ρ [kg/m³], `normal` C_n and `tangential` C_t [1]; C_t = None leaves the
-    second part out. A flat plate across the wind has C_n = 1.1 to 1.3.
+    u is the velocity of the air relative to the face, n the normal of the face and u_t the tangential part of u.
+    `velocity` [m/s] of the air is `(3,)`; `density` ρ [kg/m³], coefficients `normal` C_n and `tangential` C_t [1]. With
+    C_t = None there is no tangential term. A flat plate normal to the wind has C_n = 1.1 to 1.3.
     """
 
     couples: ClassVar[bool] = True
     surface: Cells | Triangles = eqx.field(static=True)
-    velocity: Float[Array, "..."] = quantity("wind", "m/s", kind="vector", per=None)
-    density: Float[Array, "..."] = quantity("density of the air", "kg/m³", per=None, at_least=0, default=1.225)
-    normal: Float[Array, "..."] = quantity("normal coefficient C_n", "1", per=None, at_least=0, default=1.2)
-    tangential: Float[Array, "..."] | None = quantity(
-        "tangential coefficient C_t", "1", per=None, at_least=0, default=None
-    )
+    velocity: Numbers = quantity("wind", "m/s", kind="vector", per=None)
+    density: Numbers = quantity("density of the air", "kg/m³", per=None, at_least=0, default=1.225)
+    normal: Numbers = quantity("normal coefficient C_n", "1", per=None, at_least=0, default=1.2)
+    tangential: OptionalNumbers = quantity("tangential coefficient C_t", "1", per=None, at_least=0, default=None)
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes 3"]:
-        """The wind's push on each node [N]."""
+        """The force of the air on each node [N]."""
         if state.position.shape[-2:] != (self.surface.nodes, 3):
             raise ValueError(
                 f"Wind: got positions of shape {state.position.shape}, expected (*scenes, {self.surface.nodes}, 3): the "
                 "nodes of the sheet that it was made for."
             )
-        # each node looks at several faces: apart, or their forces would be computed anew for every one of them
+        # every node reads several faces: not materialised, the force of a face would be computed for each of its corners
         return self.surface.sum_at_nodes(materialise(t, lambda: self._compute_face_forces(state)))
 
     def _compute_face_forces(self, state: Particles) -> Array:
         """The force on each face [N]."""
         area, velocity = self.surface.faces(*state)
         air = broadcast_vector(self.velocity, velocity) - velocity
-        outward = unit(area)
-        through = dot(air, outward)
-        push = scale(self.normal * jnp.abs(through) * through, outward)
+        normal = unit(area)
+        through = dot(air, normal)
+        push = scale(self.normal * jnp.abs(through) * through, normal)
         if self.tangential is not None:
-            push = push + scale(self.tangential * norm(air), air - scale(through, outward))
+            push = push + scale(self.tangential * norm(air), air - scale(through, normal))
         return scale(0.5 * self.density * norm(area), push)

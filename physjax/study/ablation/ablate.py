@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.checks import as_real_quantity
-from physjax.parts import callable_name
+from physjax.particles import callable_name
 from physjax.scene import Scene
 from physjax.stepping.simulate import simulate
 from physjax.study.ablation.variants import Variant, list_pair_variants, list_variants

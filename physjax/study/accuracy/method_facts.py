@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.particles import Particles, demand_particles
-from physjax.parts import as_module, callable_name
+from physjax.particles import Particles, callable_name, demand_particles
+from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.reference import cast_floats

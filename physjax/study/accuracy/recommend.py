@@ -4,13 +4,13 @@ A few runs of each method from coarse to fine show its error and its cost; betwe
 that is asked for, which is then verified by a run. Only what can still win is verified, and only that is timed well.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from physjax.backend import read_work_clock
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.scene import Scene
 from physjax.stepping.adaptive import adaptive
@@ -154,7 +154,7 @@ def recommend(
     respect are left out, adaptive ones also where touches are answered at the end of a step, implicit ones where no
     error leaves the step to stability. With `gradient` the derivative of the path by the start's velocity, in a
     random direction, must keep the error as well, and its time by forward mode counts. `seconds` of processor time
-    bound the search: what is not reached is said.
+    (of wall-clock time where the work is not on a CPU) bound the search: what is not reached is said.
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
 
     Example:
@@ -166,7 +166,7 @@ def recommend(
     """
     problem, errors = _check_request(scene, error, horizon, frames)
     norm, dtypes = as_error_measure(norm), [np.dtype(dtype).name for dtype in dtypes]
-    deadline = time.process_time() + float(as_real_quantity("seconds [s]", seconds, above=0.0))
+    deadline = read_work_clock() + float(as_real_quantity("seconds [s]", seconds, above=0.0))
     with jax.enable_x64(True), progress_bar(progress=progress, desc="recommend", unit="method", leave=False) as shown:
         shown.set_postfix_str("the true path")
         push = draw_random_push(scene) if gradient else None
@@ -234,10 +234,10 @@ def _explore_methods(task: SearchTask, methods: Sequence, least: float, bar: Any
         if found and 2 * longest > task.time_left():
             untried.append(name)
             continue
-        started = time.process_time()
+        started = read_work_clock()
         entry = compile_run(task.problem, method, push=task.push)
         found.append(explore_method(task, entry, least, found, _guess_fineness(found, entry)))
-        longest = max(longest, time.process_time() - started)
+        longest = max(longest, read_work_clock() - started)
         bar.update()
     return found, tuple(untried)
 

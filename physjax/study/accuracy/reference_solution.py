@@ -5,7 +5,6 @@ so large that diffrax would take minutes, our own rk4 with far finer steps, whos
 is (Richardson).
 """
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from physjax.backend import read_work_clock
 from physjax.scene import Scene
 from physjax.stepping.methods import rk4
 from physjax.stepping.reference import build_default_solver, cast_floats, solve_ode
@@ -230,7 +230,7 @@ def _make_own_solver(
     fineness = []  # of the first solution, which the nudged one shares
 
     def solve(scene, alone=False):
-        runs, count, started = [], FIRST_STEPS_PER_FRAME, time.process_time()
+        runs, count, started = [], FIRST_STEPS_PER_FRAME, read_work_clock()
         if alone:
             runs.append(_run_compiled(compiled, scene, fineness[0]))
             return runs[0][0], None, None, ""
@@ -239,7 +239,7 @@ def _make_own_solver(
             if len(runs) >= 3 and _has_converged(problem, scene, runs, wanted / 50):
                 break
             # the next takes twice as long as the last
-            if len(runs) >= 3 and 3 * (time.process_time() - started) > seconds:
+            if len(runs) >= 3 and 3 * (read_work_clock() - started) > seconds:
                 break
             count = 2 * count + 1  # steps that never end where the coarser ones did
         fineness.append(count)

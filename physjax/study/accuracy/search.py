@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from physjax.backend import read_work_clock
 from physjax.study.accuracy.error_measures import ErrorMeasure, path
 from physjax.study.accuracy.method_facts import CompiledRun
 from physjax.study.accuracy.reference_solution import ReferenceSolution
@@ -27,7 +28,7 @@ GRACE_SECONDS = 5.0
 
 
 class SearchTask(NamedTuple):
-    """What is asked of a run, and until when (`time.process_time`) there is time to answer it."""
+    """What is asked of a run, and until when (by `read_work_clock`) there is time to answer it."""
 
     problem: Problem
     truth: ReferenceSolution
@@ -37,8 +38,8 @@ class SearchTask(NamedTuple):
     deadline: float
 
     def time_left(self) -> float:
-        """Processor time left [s]."""
-        return self.deadline - time.process_time()
+        """Time left [s]: of processor time on a CPU."""
+        return self.deadline - read_work_clock()
 
     def error(self, found: Any) -> float:
         """The error of a run; of what becomes of the push as well, if there is one."""

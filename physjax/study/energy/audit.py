@@ -18,7 +18,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from physjax.loops import Moment, Time, moment_at
-from physjax.parts import Force, callable_name
+from physjax.particles import callable_name
+from physjax.parts import Force
 from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.response import collide, fold_body_flights
@@ -56,7 +57,7 @@ def _audit_single_run(run: Trajectory, substeps: Array) -> tuple[EnergyBudget, E
     assert scene is not None
     assert run.dt is not None
     dt = jnp.asarray(run.dt)
-    changes = jax.tree.map(lambda a, b: a.ndim < b.ndim, scene, film)
+    changes = scene.changing()
     frames, still = eqx.filter(film, changes), eqx.filter(scene, changes, inverse=True)
 
     def between(number, frame):
@@ -246,7 +247,7 @@ def _record_flight(whole: Scene, substeps: Array, budget: EnergyBudget, flight: 
     return _add_entries(budget, entries)
 
 
-def _find_nearest_contact(scene: Scene, timed: list[bool], t: Array, state: Any) -> list[Array]:
+def _find_nearest_contact(scene: Scene, timed: list[bool], t: Array, state: PyTree) -> list[Array]:
     """For each contact, whether it is the nearest of those that time their impacts; of coupled lanes, to any of them."""
 
     def gap(contact):

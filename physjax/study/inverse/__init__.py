@@ -1,5 +1,6 @@
 """Questions asked backwards: which launch hits, which numbers fit, which minimise; and how far gradients can be trusted."""
 
+from physjax.study.inverse import gradients
 from physjax.study.inverse.aim import Aimed, Shot, aim_at
 from physjax.study.inverse.fit import Fit, fit
 from physjax.study.inverse.gradients import GradientHealth, health
@@ -14,6 +15,7 @@ __all__ = [
     "Solution",
     "aim_at",
     "fit",
+    "gradients",
     "health",
     "minimise",
     "solve",

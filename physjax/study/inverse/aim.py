@@ -19,6 +19,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none, demand_all
+from physjax.cubics import Cubic
+from physjax.linear import solve_columns
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
 from physjax.physics.contacts.time_of_impact import impact
@@ -35,7 +37,7 @@ from physjax.study.inverse.shooting import (
     select_where,
 )
 from physjax.trajectory import Trajectory
-from physjax.vectors import dot, norm
+from physjax.vectors import components, dot, norm, stack_components
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -234,11 +236,12 @@ def _solve_by_lane(linear: Callable[[Array], Array], b: Array) -> Array:
     columns = jax.vmap(linear)(
         jnp.broadcast_to(rows.reshape((size,) + (1,) * (b.ndim - 1) + (size,)), (size, *b.shape))
     )
-    matrix = jnp.moveaxis(columns, 0, -1)
-    probe = jnp.linalg.solve(lax.stop_gradient(matrix), jnp.ones((*b.shape, 1), b.dtype))
-    sound = jnp.all(jnp.isfinite(probe), axis=(-2, -1))
-    matrix = jnp.where(sound[..., None, None], matrix, rows)
-    return jnp.where(sound[..., None], jnp.linalg.solve(matrix, b[..., None])[..., 0], 0.0)
+    matrix, right = [components(column) for column in columns], components(b)
+    probe = solve_columns(lax.stop_gradient(matrix), [jnp.ones_like(part) for part in right])
+    sound = jnp.all(jnp.isfinite(jnp.stack(probe)), axis=0)
+    # the identity stands in for a singular matrix: a choice after the solve would leave NaN in its derivative
+    matrix = [[jnp.where(sound, part, rows[i, j]) for j, part in enumerate(column)] for i, column in enumerate(matrix)]
+    return stack_components([jnp.where(sound, part, 0.0) for part in solve_columns(matrix, right)])
 
 
 def _record_height(t: Array, state: Particles, *, up: int) -> tuple[Array, Array]:
@@ -256,12 +259,7 @@ def _apex_height(recorded: tuple[Array, Array], dt: Array) -> Array:
     (y0, y1), (v0, v1) = ((a[:-1], a[1:]) for a in (height, climb))
     turns = (v0 > 0) & (v1 < 0)
     share = jnp.where(turns, v0 / jnp.where(turns, v0 - v1, 1.0), 0.0)
-    rest = 1 - share
-    top = (
-        rest**2 * (1 + 2 * share) * y0
-        + share**2 * (1 + 2 * rest) * y1
-        + share * rest * dt[None] * (rest * v0 - share * v1)
-    )
+    top = Cubic.through(y0, y1, dt[None] * v0, dt[None] * v1).at(share)
     return jnp.maximum(jnp.max(top, axis=0), height[-1])
 
 

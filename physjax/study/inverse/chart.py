@@ -27,7 +27,7 @@ def draw_shots(aimed: "Aimed", *, every: int = 1, ax: "Axes | None" = None) -> "
     target = _flatten_lanes(aimed.target)[::every]
     points = np.concatenate([*(path.reshape(-1, target.shape[-1]) for path in paths.values()), target])
     points = points[np.isfinite(points).all(axis=-1)]
-    contacts = obstacles.select_shared_surfaces(aimed.shots.scene.contacts)
+    contacts = obstacles.select_shared_surfaces(aimed.shots.scene.contacts, points.shape[-1])
     stage = obstacles.include_obstacles(Stage(points.min(axis=0), points.max(axis=0)), contacts).expand(0.05)
     own, above = ax is None, aimed.shots.scene.up
     ax = _create_shot_axes(stage, above) if ax is None else ax

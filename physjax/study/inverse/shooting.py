@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import any_lane, bounded_while_loop, compact_and_apply
+from physjax.linear import solve_columns
 from physjax.loops import RECORD
 from physjax.particles import Particles
 from physjax.scene import Scene
@@ -126,7 +127,7 @@ class AimProblem(eqx.Module):
         axes = [jnp.broadcast_to(row, v.shape) for row in jnp.eye(v.shape[-1], dtype=v.dtype)]
         directions = [Launch(axis, jnp.zeros_like(time)) for axis in axes] + [Launch(jnp.zeros_like(v), time)]
         miss, (*by_velocity, by_time) = self.sensitivity(launch, directions, steps)
-        return solve_columns(by_velocity, miss), -solve_columns(by_velocity, by_time)
+        return _solve_vectors(by_velocity, miss), -_solve_vectors(by_velocity, by_time)
 
 
 class _Search(NamedTuple):
@@ -304,7 +305,7 @@ def _solve_damped_step(slopes: tuple[Array, ...], miss: Array, damping: Array) -
         stack_components([dot(a, b) + (damping * largest if i == j else 0.0) for i, a in enumerate(slopes)])
         for j, b in enumerate(slopes)
     ]
-    return -solve_columns(normal, stack_components([dot(slope, miss) for slope in slopes]))
+    return -_solve_vectors(normal, stack_components([dot(slope, miss) for slope in slopes]))
 
 
 def perpendicular_axes(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes dim"]]:
@@ -320,19 +321,11 @@ def perpendicular_axes(velocity: Float[Array, "*lanes dim"]) -> list[Float[Array
     return [first, cross(along, first)]
 
 
-def solve_columns(
+def _solve_vectors(
     columns: list[Float[Array, "*lanes dim"]], b: Float[Array, "*lanes dim"]
 ) -> Float[Array, "*lanes dim"]:
-    """The solution of Σ xᵢ columnᵢ = b, for each lane, in two or three dimensions: Cramer's rule."""
-    if len(columns) == 2:
-        p, q = columns
-        across = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # noqa: E731
-        volumes, volume = [across(b, q), across(p, b)], across(p, q)
-    else:
-        p, q, r = columns
-        around = cross(q, r)
-        volumes, volume = [dot(b, around), dot(b, cross(r, p)), dot(b, cross(p, q))], dot(p, around)
-    return stack_components([part / volume for part in volumes])
+    """The solution of Σ xᵢ columnᵢ = b, for each lane."""
+    return stack_components(solve_columns([components(column) for column in columns], components(b)))
 
 
 def select_where(flag: Bool[Array, "*lanes"], new: State, old: State) -> State:

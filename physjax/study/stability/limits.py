@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import as_real_quantity
-from physjax.particles import Particles
-from physjax.parts import Force, as_module, callable_name
+from physjax.particles import Particles, callable_name
+from physjax.parts import Force, as_module
 from physjax.physics.springs.springs import Springs
 from physjax.scene import Scene
 from physjax.study.stability.linearisation import (

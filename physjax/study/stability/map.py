@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.checks import as_real_quantity
-from physjax.parts import as_module, callable_name
+from physjax.particles import callable_name
+from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping import methods as ours
 from physjax.stepping.reference import cast_floats

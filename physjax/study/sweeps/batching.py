@@ -22,16 +22,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, PyTree
 
-from physjax.stepping.blocks import LANES_PER_BLOCK
-from physjax.stepping.simulate import WIDE_VECTOR_OPTIONS
+from physjax.backend import MAX_BATCH_LANES, choose_block_lanes, jit_untransformed
 from physjax.study.sweeps.design import KeyPath, leaf_name
 from physjax.study.sweeps.fingerprint import HostCall, find_host_calls, list_inner_jaxprs, persistent_digest
 from physjax.trajectory import Trajectory
 
-MAX_CARRIED_BYTES = 64 * LANES_PER_BLOCK
-"""Bytes of a block that one iteration of a loop may carry, to stay in a core's cache with the stages of a step."""
-MAX_BATCH_LANES = 16 * LANES_PER_BLOCK
-"""Lanes in a batch at most: more gain nothing, and a batch is what a killed run loses and the unit of progress."""
 FAILURE_TEXTS = {
     "Run": "blew up: the run's state is not finite at its end",
     "Solution": "not solved: the search ended without a root",
@@ -153,12 +148,7 @@ def choose_layout(
         batch, size = begun
     else:
         share = math.ceil(min(lanes, batch or lanes) / len(devices))
-        # a CPU is fastest with blocks that fit its cache, an accelerator with all that it can hold
-        best = (
-            min(MAX_CARRIED_BYTES // program.carried_bytes, LANES_PER_BLOCK)
-            if devices[0].platform == "cpu"
-            else MAX_BATCH_LANES
-        )
+        best = choose_block_lanes(devices[0], program.carried_bytes)
         fitting = min(best, memory // (2 * len(devices) * program.peak_bytes))
         size = min(share, 1 << max(0, fitting.bit_length() - 1))
         left = memory - len(devices) * size * program.peak_bytes
@@ -180,15 +170,13 @@ def compile_batch(program: LaneProgram, cut: Layout, devices: tuple[jax.Device, 
 
     mesh = Mesh(np.asarray(devices), ("lanes",))
     spec = PartitionSpec("lanes")
-    platform = devices[0].platform
     if len(devices) > 1:
         batch = jax.shard_map(batch, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     shapes = [
         jax.ShapeDtypeStruct((cut.count, cut.size, *v.aval.shape), v.aval.dtype) for v in program.jaxpr.jaxpr.invars
     ]
     placed = NamedSharding(mesh, spec)
-    options = WIDE_VECTOR_OPTIONS if platform == "cpu" else None
-    whole = jax.jit(batch, in_shardings=placed, out_shardings=placed, compiler_options=options)
+    whole = jit_untransformed(batch, devices[0], in_shardings=placed, out_shardings=placed)
     executable = whole.lower(*shapes).compile()
     return lambda *flat: executable(*jax.device_put(flat, placed))
 

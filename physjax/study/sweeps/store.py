@@ -21,6 +21,7 @@ from typing import Any, Generic, TypeVar
 import jax
 import numpy as np
 
+from physjax.backend import device_kind
 from physjax.files import ensure_writable_folder, write_atomically
 
 CHUNK_FILE_PATTERN = re.compile(r"chunk-(\d{8})-([0-9a-f]{64})\.npz")
@@ -312,4 +313,4 @@ def _lock_file(path: Path, shared: bool, who: Path, wait: bool = False) -> Itera
 
 def describe_backend() -> str:
     """The kind of device and the precision, which determine the bits of a result."""
-    return f"{jax.default_backend()}, x64 {'on' if jax.config.read('jax_enable_x64') else 'off'}"
+    return f"{device_kind()}, x64 {'on' if jax.config.read('jax_enable_x64') else 'off'}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, forces, methods, simulate
-from physjax.physics.forces.gravitation import SOURCES_PER_TILE
+from physjax.backend import SOURCES_PER_TILE
 
 
 def bodies(*shape, dtype=float, seed=0):

@@ -172,7 +172,7 @@ def test_gradients_through_an_impact_agree_with_differences(derivative):
         (lambda: rigid.SurfaceContact(CORNERS, contacts.Plane((0, 0, 0), UP, friction=0.1)), "coulomb="),
         (lambda: dropped(floor(), height=0.1), "on the wrong side"),
         (lambda: Scene(Particles(jnp.zeros(3), jnp.zeros(3)), contacts=(rigid.SurfaceContact(CORNERS, floor()),)), "expected RigidBodies"),
-        (lambda: Scene(dropped(floor()).state, BOX, contacts=(floor(),)), "rigid.Touch"),
+        (lambda: Scene(dropped(floor()).state, BOX, contacts=(floor(),)), "rigid.SurfaceContact"),
         (
             lambda: Scene(
                 RigidBodies(*dropped(floor()).state), BOX, contacts=(rigid.SurfaceContact(rigid.ContactPoints(jnp.zeros((4, 2, 3))), floor()),)
