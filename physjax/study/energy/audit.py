@@ -56,6 +56,8 @@ def _audit_single_run(run: Trajectory, substeps: Array) -> tuple[EnergyBudget, E
     scene, film = run.scene, run.film
     assert scene is not None
     assert run.dt is not None
+    assert run.stepper is not None
+    stepper = run.stepper
     dt = jnp.asarray(run.dt)
     changes = scene.changing()
     frames, still = eqx.filter(film, changes), eqx.filter(scene, changes, inverse=True)
@@ -65,7 +67,7 @@ def _audit_single_run(run: Trajectory, substeps: Array) -> tuple[EnergyBudget, E
             moving, budget = carry
             count = run.first_step + number * run.save_every + i
             t = moment_at(count, dt, scene.state.dtype)
-            after, budget = _audit_step(eqx.combine(moving, still), run.stepper, t, dt, substeps, budget)
+            after, budget = _audit_step(eqx.combine(moving, still), stepper, t, dt, substeps, budget)
             return eqx.filter(after, changes), budget
 
         return lax.fori_loop(0, run.save_every, step, (frame, build_empty_budget(scene)))[1]

@@ -60,7 +60,7 @@ def _draw_totals(ax: "Axes", totals: dict[str, float], styles: dict[str, dict[st
     ax.barh(places, values, color=[styles[name]["color"] for name in totals], height=0.65)
     ax.axvline(0, color="0.4", linewidth=0.8)
     reach = np.abs(values).max() or 1.0
-    for place, value in zip(places, values, strict=True):
+    for place, value in enumerate(values):
         side = "left" if value >= 0 else "right"
         ax.text(
             value + 0.012 * reach * (1 if value >= 0 else -1), place, f"{value:.4g}", ha=side, va="center", fontsize=9
