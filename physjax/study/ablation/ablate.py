@@ -187,8 +187,7 @@ def ablate(
     times, costs = _time_runs(runs, seconds), [_count_step_cost(one.scene, method, dt) for one in everything]
     threshold = np.broadcast_to(error * np.abs(value if scale is None else np.asarray(scale, float)), value.shape)
     compare = partial(_compare_with_whole, whole=measured[0], clock=times[0], threshold=threshold)
-    names = [one.name for one in everything]
-    effects = list(map(compare, names, measured, times, costs))
+    effects = list(map(compare, [one.name for one in everything], measured, times, costs))
     return Ablation(effects[0], tuple(effects[1:]), threshold, callable_name(method), float(dt), tuple(notes))
 
 

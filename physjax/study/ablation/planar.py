@@ -7,7 +7,7 @@ part does with its numbers, or with a static field, no declaration can say.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ STILL_ROUNDINGS = 64
 AGREEMENT_SHARE = 1e-4
 """Share of the largest load or distance by which a reduced part may differ from the whole: rounding in float32."""
 
+Part = TypeVar("Part", bound=Force | Contact)
 RestoreStates = Callable[[Particles], Particles]
 
 
@@ -91,7 +92,7 @@ def _find_still_axis(run: Trajectory) -> int | None:
     return int(np.flatnonzero(still)[-1]) if still.any() else None
 
 
-def _reduce_part(part: Force | Contact, plane: _Plane) -> Force | Contact:
+def _reduce_part(part: Part, plane: _Plane) -> Part:
     """A force or contact in the plane; `_Reason` if it has no counterpart there."""
     numbers, structure = collect_numbers(part)
     name = callable_name(part)
@@ -108,7 +109,7 @@ def _reduce_part(part: Force | Contact, plane: _Plane) -> Force | Contact:
     return flat
 
 
-def forget_contacts(part: Force | Contact) -> Force | Contact:
+def forget_contacts(part: Part) -> Part:
     """A contact without its memory, which belongs to the lanes of a scene; a force as it is."""
     return replace(part, **dict.fromkeys(part.memory)) if isinstance(part, Contact) and part.memory else part
 

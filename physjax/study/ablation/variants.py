@@ -159,10 +159,13 @@ def _list_simpler_springs(springs: Springs) -> list[tuple[str, Part]]:
     spread = [None if number is None else np.broadcast_to(np.asarray(number), (count,)) for number in numbers]
     stiffness, rest_length, damping, breaks_at = spread
     assert stiffness is not None
+    assert rest_length is not None
 
     def select_springs(kept, damping=damping):
-        numbers = [None if a is None else a[kept] for a in (stiffness, rest_length, damping, breaks_at)]
-        return Springs(np.asarray(springs.pairs)[kept], *numbers, nodes=springs.nodes)
+        options = [None if a is None else a[kept] for a in (damping, breaks_at)]
+        return Springs(
+            np.asarray(springs.pairs)[kept], stiffness[kept], rest_length[kept], *options, nodes=springs.nodes
+        )
 
     simpler: list[tuple[str, Part]] = []
     if damping is not None:

@@ -1,4 +1,4 @@
-"""Energy, momentum and angular momentum of a scene: what its physics keeps, and so what a method must not lose."""
+"""Energy, momentum and angular momentum of a scene: what its physics conserves, and so what a method should."""
 
 from physjax.study.energy.quantities import (
     ANGULAR_MOMENTUM,

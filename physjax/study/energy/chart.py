@@ -1,16 +1,23 @@
 """A ledger drawn: who received the energy of a run, over time and in the end."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from physjax.show.style import PALETTE
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from physjax.study.energy.budget import Ledger
+
 NUMERICAL_COLOUR = "0.15"
 LINE_STYLES = ("-", "--", ":")
 
 
-def draw_energy_budget(result: Any, figure: Any = None) -> Any:
+def draw_energy_budget(result: "Ledger", figure: "Figure | None" = None) -> "Figure":
     """Energy received over time, and a bar for each total, summed over all lanes; returns the figure."""
     from matplotlib import pyplot as plt
 
@@ -34,8 +41,8 @@ def draw_energy_budget(result: Any, figure: Any = None) -> Any:
     return figure
 
 
-def _choose_styles(names: Any) -> dict[str, dict]:
-    """A colour for each entry; the method's own share is black and thick."""
+def _choose_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """A colour for each entry; the method's own error is black and thick."""
     colours = [colour for colour in PALETTE if colour != PALETTE[0]]
     styles = {}
     for i, name in enumerate(name for name in names if name != "numerical"):
@@ -46,14 +53,14 @@ def _choose_styles(names: Any) -> dict[str, dict]:
     return styles | {"numerical": {"color": NUMERICAL_COLOUR, "linestyle": "-", "linewidth": 2.2}}
 
 
-def _draw_totals(ax: Any, totals: dict[str, float], styles: dict[str, dict]) -> None:
+def _draw_totals(ax: "Axes", totals: dict[str, float], styles: dict[str, dict[str, Any]]) -> None:
     """A bar for each entry with its number, the first on top."""
     places = np.arange(len(totals))
     values = np.array(list(totals.values()))
     ax.barh(places, values, color=[styles[name]["color"] for name in totals], height=0.65)
     ax.axvline(0, color="0.4", linewidth=0.8)
     reach = np.abs(values).max() or 1.0
-    for place, value in zip(places, values, strict=True):
+    for place, value in enumerate(values):
         side = "left" if value >= 0 else "right"
         ax.text(
             value + 0.012 * reach * (1 if value >= 0 else -1), place, f"{value:.4g}", ha=side, va="center", fontsize=9

@@ -1,15 +1,18 @@
-"""Energy, momentum and angular momentum of a scene: what its physics keeps, and so what a method must not lose."""
+"""Energy, momentum and angular momentum of a scene: what its physics conserves, and so what a method should."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from physjax.scene import Scene
 from physjax.trajectory import Trajectory
 from physjax.vectors import cross, norm
+
+if TYPE_CHECKING:
+    from physjax.study.energy.budget import Ledger
 
 
 class Conserved(NamedTuple):
@@ -23,11 +26,11 @@ class Conserved(NamedTuple):
     """
 
     name: str
-    value: Callable[[Scene, ArrayLike, Any], Array]
-    size: Callable[[Scene, ArrayLike, Any], Array]
+    value: Callable[[Scene, ArrayLike, PyTree], Array]
+    size: Callable[[Scene, ArrayLike, PyTree], Array]
 
 
-def kinetic(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+def kinetic(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
     """½mv² [J], of rigid bodies with ½ω·L, per lane or summed over coupled ones.
 
     Example:
@@ -37,7 +40,7 @@ def kinetic(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     return summed(scene, state.kinetic_energy(scene.mass))
 
 
-def potential(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+def potential(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
     """Potential energy of all forces that have one [J], per lane or summed over coupled ones.
 
     Example:
@@ -49,7 +52,7 @@ def potential(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     return summed(scene, sum(terms, jnp.zeros_like(state.position[..., 0])))
 
 
-def total(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+def total(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
     """Kinetic and potential energy [J], per lane or summed over coupled ones.
 
     Example:
@@ -59,7 +62,7 @@ def total(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     return kinetic(scene, t, state) + potential(scene, t, state)
 
 
-def momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+def momentum(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
     """Σmv [kg m/s], per lane or summed over coupled ones; the component last.
 
     Example:
@@ -70,7 +73,7 @@ def momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
     return jnp.sum(p, axis=-2) if scene.couples else p
 
 
-def angular_momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..."]:
+def angular_momentum(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
     """Σ r × mv about the origin [kg m²/s], of rigid bodies with their own; a number in the plane, a vector in space.
 
     Example:
@@ -84,7 +87,7 @@ def angular_momentum(scene: Scene, t: ArrayLike, state: Any) -> Float[Array, "..
     return jnp.sum(spin, axis=-2) if scene.couples else spin
 
 
-def _angular_momentum_size(scene: Scene, state: Any) -> Array:
+def _angular_momentum_size(scene: Scene, state: PyTree) -> Array:
     arms = norm(state.position) * norm(state.linear_momentum(scene.mass))
     return arms + norm(state.own_spin(scene.mass)) if state.rotates else arms
 
@@ -111,14 +114,14 @@ ANGULAR_MOMENTUM = Conserved(
 """Angular momentum about the origin, its errors measured by Σm|r||v|, and |L| of rigid bodies."""
 
 
-def ledger(trajectory: Trajectory, scene: Scene | None = None) -> Any:
+def ledger(trajectory: Trajectory, scene: Scene | None = None) -> "Ledger":
     """Where the energy of a run went, and its momentum and angular momentum: a `Ledger`, to be printed or drawn (`.plot()`).
 
-    Every step is made again from the frames and set beside the exact motion from the same start, along which the work
-    and the impulse of each force are integrated: so the method's own gain or loss is measured, and that the books close
-    is a test. In float64 whatever the run's type; the rounding of a float32 run is then the method's. Costs some hundred
-    evaluations of the forces a step. Give the `scene` if the trajectory does not know it. Raises TypeError or ValueError for
-    what is no run of a method, and for contacts with a response of one's own.
+    Every step is taken again from the frames and compared with the exact motion from the same start, along which the work
+    and the impulse of each force are integrated: so the method's own gain or loss is measured, and that the entries sum to
+    zero is a test. In float64 whatever the run's type; the rounding of a float32 run then counts as the method's. Costs a
+    few hundred evaluations of the forces per step. Give the `scene` if the trajectory does not know it. Raises TypeError or
+    ValueError for what is no run of a method, and for contacts with a user's own response.
 
     Example:
         >>> received = energy.ledger(flight).energy.totals

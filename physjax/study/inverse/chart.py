@@ -34,7 +34,7 @@ def draw_shots(aimed: "Aimed", *, every: int = 1, ax: "Axes | None" = None) -> "
     if target.shape[-1] == 2:
         obstacles.draw_flat(ax, stage, contacts, 0.0)
     else:
-        obstacles.draw_in_space(ax, stage, contacts, 0.0, above)
+        obstacles.draw_in_space(ax, stage, contacts, 0.0, above)  # pyright: ignore[reportArgumentType]  # 3-D axes
     for (name, shot), colour in zip(arcs.items(), (LOW_COLOUR, HIGH_COLOUR), strict=False):
         _draw_arc(ax, paths[name], np.asarray(shot.ok).ravel()[::every], colour, _describe_arc(name, shot))
     start = next(iter(paths.values()))[0]

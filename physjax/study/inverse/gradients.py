@@ -118,14 +118,20 @@ def health(
     mismatch, ok = None, jnp.ones(horizon.shape, bool)
     if reverse or (reverse is None and not (isinstance(method, Adaptive) and method.tries is None)):
         pull = jax.vjp(lambda leaf: positions(leaf)[0], start)[1]
-        mismatch, whole = _measure_mismatch(scene, spread, pull)
-        # where paths from rounded starts go apart, so do the two programs
-        allowed = (
-            float(jnp.finfo(start.dtype).eps) ** 0.5 + MISMATCH_ROUNDING_FACTOR * jnp.max(sensitivity, axis=0) / limit
-        )
-        ok = jnp.isfinite(mismatch) & (mismatch <= allowed)
+        mismatch, ok, whole = _check_reverse_mode(scene, spread, pull, limit)
         horizon = jnp.where(ok | ~whole, horizon, 0.0)
     return GradientHealth(moments, sensitivity, *law, limit, horizon, mismatch, ok, fraction, of)
+
+
+def _check_reverse_mode(
+    scene: Scene, spread: "_Spread", pull: Callable[[Array], tuple[Array]], limit: Array
+) -> tuple[Array, Array, Array]:
+    """How far reverse mode is from forward mode, whether that is rounding, and for which units forward mode is finite."""
+    mismatch, whole = _measure_mismatch(scene, spread, pull)
+    # where paths from rounded starts go apart, so do the two programs
+    growth = jnp.max(spread.sensitivity, axis=0) / limit
+    allowed = float(jnp.finfo(spread.sensitivity.dtype).eps) ** 0.5 + MISMATCH_ROUNDING_FACTOR * growth
+    return mismatch, jnp.isfinite(mismatch) & (mismatch <= allowed), whole
 
 
 class _Spread(NamedTuple):

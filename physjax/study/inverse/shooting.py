@@ -207,7 +207,8 @@ def _iterate_lanes(
     def body(search):
         return compact_and_apply(once, search.active, search, *others, masks=masks, cut=cut)
 
-    return bounded_while_loop(lambda search: any_lane(search.active), body, begin, most=most)
+    going = lambda search: any_lane(search.active)  # noqa: E731
+    return bounded_while_loop(going, body, begin, most=most)
 
 
 def _estimate_launch(

@@ -170,13 +170,14 @@ def compile_batch(program: LaneProgram, cut: Layout, devices: tuple[jax.Device, 
 
     mesh = Mesh(np.asarray(devices), ("lanes",))
     spec = PartitionSpec("lanes")
+    first = devices[0]
     if len(devices) > 1:
         batch = jax.shard_map(batch, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     shapes = [
         jax.ShapeDtypeStruct((cut.count, cut.size, *v.aval.shape), v.aval.dtype) for v in program.jaxpr.jaxpr.invars
     ]
     placed = NamedSharding(mesh, spec)
-    whole = jit_untransformed(batch, devices[0], in_shardings=placed, out_shardings=placed)
+    whole = jit_untransformed(batch, first, in_shardings=placed, out_shardings=placed)
     executable = whole.lower(*shapes).compile()
     return lambda *flat: executable(*jax.device_put(flat, placed))
 
