@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from physjax.particles import Particles
-from physjax.parts import Contact, Force, callable_name, find_plain_functions
+from physjax.particles import Particles, callable_name
+from physjax.parts import Contact, Force, find_plain_functions
 from physjax.quantities import Number, collect_numbers
 from physjax.scene import Scene
 from physjax.trajectory import Trajectory

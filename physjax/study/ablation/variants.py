@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from physjax.checks import as_positive_integer
-from physjax.particles import Particles
-from physjax.parts import Contact, Force, callable_name, find_plain_functions
+from physjax.particles import Particles, callable_name
+from physjax.parts import Contact, Force, find_plain_functions
 from physjax.physics import contacts, forces
 from physjax.physics.springs.springs import Springs
 from physjax.quantities import collect_numbers

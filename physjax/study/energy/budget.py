@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.parts import callable_name
+from physjax.particles import callable_name
 from physjax.scene import Scene, project
 from physjax.study.energy.audit import NUMERICAL, RESPONSE_OBSERVERS, EnergyBudget, audit_run, list_causes
 from physjax.text import format_table
