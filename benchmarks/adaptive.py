@@ -166,7 +166,7 @@ def main() -> None:
     rejected = max(row["rejected"] / row["tries"] for row in rows if "tries" in row)
     bars = [
         Bar("evaluations at an error of 1e-6, adaptive / equal steps of rk4", share, "<=", 1 / 3),
-        Bar("largest share of rejected tries", rejected, "<=", 0.05),
+        Bar("largest share of rejected steps", rejected, "<=", 0.05),
         Bar("drift of energy of symplectic methods, adaptive / equal steps [times]", drift_ratio, ">=", 10.0),
     ]
     print(harness.format_caption(about))

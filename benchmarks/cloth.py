@@ -275,7 +275,7 @@ def race(scene: Scene, size: Settings) -> tuple[list[dict], dict[str, str]]:
     return [harness.make_row(n, contenders[n].family, work, t) for n, t in timings.items()], missing | failed
 
 
-def measure_second(count: int) -> dict[str, Any]:
+def measure_second(count: int) -> dict[str, object]:
     """Where a cloth is after a second, and how far from where it must be."""
     x = np.asarray(simulate_final(build_grid(count), 960), float)
     error = float(np.abs(x.mean(axis=0) - EXPECTED_MEANS[count]).max())

@@ -79,7 +79,7 @@ def time_frames(scene: Scene, frames: int) -> tuple[list[float], list[int], list
     return seconds, products, residuals, middle
 
 
-def build_system(scene: Scene) -> tuple[Any, jax.Array]:
+def build_system(scene: Scene) -> tuple[Callable, jax.Array]:
     """The matrix of a linearised step, as a function, and its right-hand side; nodes are equally heavy."""
     linearised = scene.linearised_at(DT, scene.state)
     x, v = scene.state
