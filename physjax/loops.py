@@ -13,6 +13,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from physjax.backend import jit_is_disabled
+
 LAST_STEP = 2**31 - 1
 """The highest number that a step can have: steps are counted in 32 bits."""
 LARGEST_SNAP_SHARE = 1 / 64
@@ -38,7 +40,7 @@ class Moment(eqx.Module):
     start: Float[Array, "..."] = eqx.field(metadata=RECORD)
     rest: Float[Array, "..."] = eqx.field(metadata=RECORD)
     step: Float[Array, "..."] = eqx.field(metadata=RECORD)
-    elapsed: Float[Array, "..."] | None = eqx.field(default=None, metadata=RECORD)
+    elapsed: ArrayLike | None = eqx.field(default=None, metadata=RECORD)
 
     @classmethod
     def of(cls, t: Any, dt: ArrayLike, dtype: np.dtype | None = None) -> "Moment":
@@ -208,7 +210,7 @@ def repeat_steps(step: Callable, carry: Any, first: Array, count: int) -> Any:
     """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
     if count == 1:
         return step(first, carry)
-    if jax.config.jax_disable_jit:  # a checkpoint would trace it all the same, and hide the numbers from who looks
+    if jit_is_disabled():  # a checkpoint would trace it all the same, and hide the numbers from who looks
         return reduce(lambda carry, i: step(first + i, carry), range(count), carry)
     inner = _choose_chunk_length(count) if count > 16 else count
     outer, rest = divmod(count, inner)

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -106,7 +107,7 @@ class Adaptive(eqx.Module):
             end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
         # a dt or a tolerance that is traced cannot raise; one that is not > 0 has no end and no error
         bounds = (dt, *(b for b in (self.atol, self.rtol, self.dt_min, self.dt_max) if b is not None))
-        legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, jax.core.Tracer)]
+        legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, Tracer)]
         ok = reduce(jnp.logical_and, legal, ~end.failed & ~end.going(dt))
         # a product and no choice: the derivatives of what is not a number are none either, where a choice would say zero
         state = jax.tree.map(
@@ -170,7 +171,7 @@ class Adaptive(eqx.Module):
             jnp.isfinite(error), jnp.clip(factor, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR), SMALLEST_STEP_FACTOR
         )
 
-    def _measure_error(self, start: S, whole: S, halves: S, shape: tuple[int, ...]) -> Array:
+    def _measure_error(self, start: PyTree, whole: PyTree, halves: PyTree, shape: tuple[int, ...]) -> Array:
         """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
         if self.error == "velocity":
             demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
@@ -252,6 +253,7 @@ def adaptive(
     """
     if not callable(method):
         raise TypeError(f"adaptive: got the method {method!r}, expected one such as methods.rk4.")
+    module = as_module(method)
     if error not in ("state", "velocity"):
         raise ValueError(f"error: got {error!r}, expected 'state' or 'velocity' (the lecture's).")
     promised = method.promises.order if isinstance(method, PromisingMethod) else None
@@ -263,10 +265,11 @@ def adaptive(
         for name, h in (("dt_min", dt_min), ("dt_max", dt_max))
     )
     known = [concrete_or_none(h) for h in (dt_min, dt_max) if h is not None]
-    if len(known) == 2 and all(h is not None for h in known) and known[0] > known[1]:
-        raise ValueError(f"dt_min: got {known[0]:g} s, which is more than dt_max {known[1]:g} s. Exchange them.")
+    shortest, longest = known if len(known) == 2 else (None, None)
+    if shortest is not None and longest is not None and shortest > longest:
+        raise ValueError(f"dt_min: got {shortest:g} s, which is more than dt_max {longest:g} s. Exchange them.")
     return Adaptive(
-        as_module(method),
+        module,
         atol,
         rtol,
         dt_min,

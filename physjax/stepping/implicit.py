@@ -6,6 +6,7 @@ simulation", 1998) it is (1 - dt ∂a/∂v - dt² ∂a/∂x) Δv = dt (a + dt �
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -173,7 +174,7 @@ class _Step(NamedTuple):
     system: System
     end: Time
     state: PyTree
-    dt: ArrayLike
+    dt: jax.Array
     kicked_leaves: tuple[bool, ...]
 
     @classmethod
@@ -239,11 +240,11 @@ class _Step(NamedTuple):
     def _mass(self) -> jax.Array:
         """The mass of each lane; one for bodies, whose momenta are not velocities, and for a system without masses."""
         mass = read_traits(self.system).mass
-        return mass if isinstance(mass, jax.Array | np.ndarray) else jnp.ones((), self.dt.dtype)
+        return jnp.asarray(mass) if isinstance(mass, jax.Array | np.ndarray) else jnp.ones((), self.dt.dtype)
 
     def _sum(self, a: Vector, b: Vector) -> jax.Array:
         kept = len(read_traits(self.system).status_shape)
-        return sum(_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True))
+        return reduce(jnp.add, [_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True)])
 
 
 def _sum_trailing_axes(a: jax.Array, kept: int) -> jax.Array:

@@ -117,7 +117,7 @@ def _safe_ratio(above: Array, below: Array, going: Array) -> Array:
     return jnp.where(good, above, 0.0) / jnp.where(good, below, 1.0)
 
 
-def build_report(square: Array, size: Array, goal: Array, count: Array) -> SolveReport:
+def build_report(square: Array, size: Array, goal: ArrayLike, count: Array) -> SolveReport:
     """The report on a solve whose residual has the square `square`, of a right-hand side with the square `size`."""
     present = size > 0
     residual = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))

@@ -135,8 +135,11 @@ def solve_ode(
     """
     import diffrax
 
-    norm = {"norm": _max_norm} if strict else {}
-    controller = diffrax.PIDController(rtol=rtol, atol=atol, **norm)
+    controller = (
+        diffrax.PIDController(rtol=rtol, atol=atol, norm=_max_norm)
+        if strict
+        else diffrax.PIDController(rtol=rtol, atol=atol)
+    )
     jumps = discontinuities(scene)
     if jumps.size or strict:
         controller = diffrax.ClipStepSizeController(

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
@@ -152,7 +153,7 @@ def _is_untransformed(run: tuple) -> bool:
     ours = all(
         map(_is_library_definition, (*map(type, parts), *(plain.function for plain in find_plain_functions(parts))))
     )
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
+    traced = any(isinstance(leaf, Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
     return ours and not traced
 
 
@@ -248,7 +249,7 @@ def _check_dt(dt: ArrayLike, scene: Scene) -> Array:
 
 def _invalidate_nonpositive(duration: Array) -> Array:
     """A duration [s], NaN where it is traced and not > 0: then the run's status says so."""
-    return jnp.where(duration > 0, duration, jnp.nan) if isinstance(duration, jax.core.Tracer) else duration
+    return jnp.where(duration > 0, duration, jnp.nan) if isinstance(duration, Tracer) else duration
 
 
 def _check_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> int:
@@ -258,7 +259,7 @@ def _check_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> in
         raise ValueError(f"simulate: got {given} of steps and duration, expected exactly one of them.")
     if steps is not None:
         return as_positive_integer("steps", steps)
-    if isinstance(dt, jax.core.Tracer) or isinstance(duration, jax.core.Tracer):
+    if isinstance(dt, Tracer) or isinstance(duration, Tracer):
         raise TypeError(
             "duration: dt or duration is being traced, so the number of steps is unknown. Give steps= instead."
         )
