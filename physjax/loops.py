@@ -31,10 +31,10 @@ RECORD = {"record": True}
 
 
 class Moment(eqx.Module):
-    """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what is over.
+    """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what has passed.
 
     Differences are taken before they are rounded, so that 5 ms are 5 ms after a day in float32, where the time itself is
-    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene are told `to_float_time(moment)`, a float.
+    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene get `to_float_time(moment)`, a float.
     """
 
     start: Float[Array, "..."] = eqx.field(metadata=RECORD)
@@ -59,7 +59,7 @@ class Moment(eqx.Module):
         return to_float_time(self)
 
     def time_until(self, time: Array, rest: ArrayLike = 0.0) -> Array:
-        """How long it is until a time [s], given as a number and what its rounding left out; negative where it is over."""
+        """How long it is until a time [s], given as a number and what its rounding left out; negative where it has passed."""
         ahead = self._ahead(time, rest)
         return ahead if self.elapsed is None else ahead - self.elapsed
 
@@ -105,23 +105,23 @@ def to_float_time(t: Any) -> Any:
 
 
 def time_for_part(part: Any, t: Any) -> Any:
-    """The time as a part of a scene is told it: the moment itself only if it asks for moments, as those of the library."""
+    """The time as a part of a scene gets it: the moment itself only if it asks for moments, as those of the library do."""
     return t if getattr(part, "sees_moments", False) is True else to_float_time(t)
 
 
 def time_for_method(method: Any, t: Any) -> Any:
-    """The time as a method is told it, which may have another inside: a user's gets a float."""
+    """The time as a method gets it, which may hold another: one of the user gets a float."""
     inner = getattr(method, "method", None)
     return t if is_library_part(method) and (inner is None or is_library_part(inner)) else to_float_time(t)
 
 
 def respond_at_float_time(response: Callable, motion: Callable, scene: Any, t: Any, dt: ArrayLike) -> Any:
-    """A user's response, which is told the time as a float."""
+    """A user's contact response, which gets the time as a float."""
     return response(motion, scene, to_float_time(t), dt)
 
 
 def is_library_part(part: Any) -> bool:
-    """Whether a function or a module is the library's own, which may be told a moment instead of a float."""
+    """Whether a function or a module is the library's own, which may get a moment instead of a float."""
     return getattr(getattr(part, "function", part), "__module__", "").startswith("physjax.")
 
 

@@ -41,12 +41,12 @@ MAX_HALVINGS = 8
 class ImplicitEuler(eqx.Module):
     """Implicit Euler: kick with the force at the end of the step, then drift. Stable at any step on linear springs.
 
-    Damps an oscillation by 1/√(1 + ω²dt²) a step, whether that is meant or not. Once a step the force is linearised
-    (`newton` = 0); `newton` > 0 converges the full equation in at most so many steps of Newton's method. Independent
+    Damps an oscillation by 1/√(1 + ω²dt²) a step, also where no damping is wanted. Once a step the force is linearised
+    (`newton` = 0); `newton` > 0 converges the full equation in at most `newton` steps of Newton's method. Independent
     lanes solve a small system each, coupled scenes one for each scene by at most `iterations` products with its matrix:
-    conjugate gradients where every force always pushes back (springs do, by their `linearised_at`), BiCGSTAB otherwise.
+    conjugate gradients where every force is `dissipative_symmetric` (springs are, by their `linearised_at`), BiCGSTAB otherwise.
     `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass: √ε of the float type by
-    default. A solve that does not converge raises nothing: `report` says so, with its residual. Derivatives go through
+    default. A solve that does not converge raises nothing: `report` returns its residual. Derivatives go through
     the solution, not the iterations. Raises ValueError or TypeError for bad settings.
 
     Example:
@@ -128,7 +128,7 @@ class ImplicitEuler(eqx.Module):
         def body(carry):
             u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
-            # no more digits than are still missing
+            # solving for more digits than Newton's method still misses would be wasted
             missing = jnp.sqrt(goal / jnp.where(square > 0, square, 1.0))
             change, reported = self._solve_linear(
                 step, tangent, r, jnp.clip(0.1 * missing, SMALLEST_FORCING_TERM, LARGEST_FORCING_TERM), False
@@ -213,7 +213,7 @@ class _Step(NamedTuple):
         return [jnp.zeros_like(leaf) for leaf in self.select_kicked(self.state)]
 
     def mask_held(self, u: Vector) -> Vector:
-        """u without what held lanes have of it, which is nothing: the matrix then is symmetric in them as well."""
+        """u with zero for held lanes, which do not move: the matrix is then symmetric in them as well."""
         held = read_traits(self.system).held
         return u if held is None else [scale(1 - held.astype(leaf.dtype), leaf) for leaf in u]
 

@@ -1,8 +1,8 @@
 """The loop: repeat a scene's step, keep frames, count time.
 
-The number of steps is shape (a scan, which can be differentiated); dt and every physical number are not, so changing
-them compiles nothing. Reverse mode keeps the state at the frames and recomputes between them in nested scans: memory
-O(frames + √save_every).
+The number of steps is part of the program's shape (a scan, which can be differentiated); dt and every physical number
+are data, so that changing them recompiles nothing. Reverse mode keeps the state at the frames and recomputes between
+them in nested scans: memory O(frames + √save_every).
 """
 
 import functools
@@ -46,7 +46,7 @@ def simulate(
 
     Give `steps`, or a `duration` [s] that is a multiple of `dt` [s]. `dt` is a scalar or shaped like
     `scene.status_shape`. Frame 0 is the start. `record=f(t, state)` keeps only that instead of the whole state; name
-    the function once, a new one compiles anew. `first_step` continues the count of time: `simulate(flight.final_scene,
+    the function once, a new one recompiles. `first_step` continues the count of time: `simulate(flight.final_scene,
     ..., first_step=flight.final_step)` resumes a run, up to step 2³¹ - 1. Under jit, vmap, jvp and grad as well. Raises
     ValueError or TypeError for bad numbers; a run that blows up does not raise, it returns with `.ok` False and
     `.first_bad_step`.
@@ -140,12 +140,12 @@ def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
 
 
 def _is_compile_bound(scene: Scene) -> bool:
-    """Whether compiling is what a run costs: few lanes, and contacts that remember."""
+    """Whether compiling costs more than running: few lanes, and contacts with memory, which are many small kernels."""
     return math.prod(scene.state.lanes) < MIN_LANES_TO_SELECT and any(contact.memory for contact in scene.contacts)
 
 
 def _is_untransformed(run: tuple) -> bool:
-    """Whether a run is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
+    """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
     scene, method, *_ = run
     path = () if scene.prescribed_motion is None else (scene.prescribed_motion.path,)
     source = () if scene.emitter is None else (scene.emitter.source,)
@@ -173,7 +173,7 @@ def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene
 def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: ArrayLike, frames: int) -> Any:
     """States at `frames` + 1 equally spaced times, with a number of steps between them that is data, not shape.
 
-    One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
+    One compilation serves every step size, as studies of the step need. A loop of a traced length has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
     changing = scene.changing()
