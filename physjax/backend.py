@@ -18,7 +18,7 @@ import time
 import warnings
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,16 @@ From jax 0.11 on there are no others, and the option is gone.
 """
 
 
+@runtime_checkable
+class Device(Protocol):
+    """A device as jax lists it, of which only the kind counts."""
+
+    @property
+    def platform(self) -> str:
+        """The kind: "cpu", "gpu" or "tpu"."""
+        ...
+
+
 def device_kind() -> str:
     """The kind of the device that computes by default: "cpu", "gpu" or "tpu"."""
     return jax.default_backend()
@@ -67,6 +77,11 @@ def device_kind() -> str:
 def on_cpu() -> bool:
     """Whether the default device is a CPU."""
     return device_kind() == "cpu"
+
+
+def jit_is_disabled() -> bool:
+    """Whether programs run operation by operation, as under `jax.disable_jit()`, so that all numbers can be looked at."""
+    return jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue] - jax adds its flags at run time
 
 
 def describe_device() -> str:
@@ -291,7 +306,7 @@ def count_lane_blocks(lanes: int, steps_per_frame: int) -> int | None:
     return math.ceil(lanes / LANES_PER_BLOCK)
 
 
-def choose_block_lanes(device: jax.Device, carried_bytes: int) -> int:
+def choose_block_lanes(device: Device, carried_bytes: int) -> int:
     """Lanes in a block of a sweep on a device, where each carries so many bytes through a loop.
 
     A CPU is fastest in its cache, anything else with all that it can hold.
@@ -303,7 +318,7 @@ def choose_block_lanes(device: jax.Device, carried_bytes: int) -> int:
 
 
 def jit_untransformed(
-    function: Callable[..., T], device: jax.Device | None = None, *, many_small_kernels: bool = False, **options: Any
+    function: Callable[..., T], device: Device | None = None, *, many_small_kernels: bool = False, **options: Any
 ) -> Callable[..., T]:
     """`jax.jit(function, **options)` with what makes a program fast on a device, the default one unless given.
 
@@ -311,8 +326,8 @@ def jit_untransformed(
     them inside of another. An option that the installed compiler does not know is left out with a warning.
     `many_small_kernels` asks for what compiles those sooner.
     """
-    device = jax.devices()[0] if device is None else device
-    if device.platform != "cpu":
+    kind = device_kind() if device is None else device.platform
+    if kind != "cpu":
         return jax.jit(function, **options)
     wanted = dict(WIDE_VECTOR_OPTIONS)
     if many_small_kernels and jax.__version_info__ < (0, 11):

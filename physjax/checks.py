@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -21,7 +22,7 @@ NestedArrayLike = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]
 
 def concrete_or_none(value: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is being traced."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return None
     return np.asarray(jax.device_get(value) if isinstance(value, jax.Array) else value)
 
@@ -222,7 +223,7 @@ def _build_metadata(quantity: Quantity) -> dict[str, Any]:
 
 def as_positive_integer(name: str, value: Any, *, at_least: int = 1) -> int:
     """A Python int of at least `at_least`; a count is part of the program's shape and cannot be traced."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         raise TypeError(
             f"{name}: got a traced value, expected a Python int: counts are shape. Pass it as a static argument."
         )

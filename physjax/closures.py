@@ -13,8 +13,10 @@ from types import CodeType
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import jax
 import jax.numpy as jnp
+from jax.core import Tracer
+
+from physjax.backend import jit_is_disabled
 
 WRAPPER_PACKAGES = {"physjax", "contextlib", "equinox", "jaxtyping", "beartype"}
 """Whose frames stand between a user's call and the place where it is judged."""
@@ -30,7 +32,7 @@ def warn_of_recompilation(who: str, functions: Iterable[Any]) -> None:
     Only where the call itself compiles: not inside of a user's `jit`, which is compiled once, nor under `disable_jit`.
     """
     found = [(function, code) for function in functions if (code := _find_code(function)) is not None]
-    if not found or jax.config.jax_disable_jit or isinstance(jnp.zeros(()), jax.core.Tracer):
+    if not found or jit_is_disabled() or isinstance(jnp.zeros(()), Tracer):
         return
     for function, code in found:
         before = _last_compiled.get(code, function)

@@ -13,6 +13,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from physjax.backend import jit_is_disabled
+
 LAST_STEP = 2**31 - 1
 """The highest number that a step can have: steps are counted in 32 bits."""
 LARGEST_SNAP_SHARE = 1 / 64
@@ -29,16 +31,16 @@ RECORD = {"record": True}
 
 
 class Moment(eqx.Module):
-    """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what is over.
+    """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what has passed.
 
     Differences are taken before they are rounded, so that 5 ms are 5 ms after a day in float32, where the time itself is
-    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene are told `to_float_time(moment)`, a float.
+    known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene get `to_float_time(moment)`, a float.
     """
 
     start: Float[Array, "..."] = eqx.field(metadata=RECORD)
     rest: Float[Array, "..."] = eqx.field(metadata=RECORD)
     step: Float[Array, "..."] = eqx.field(metadata=RECORD)
-    elapsed: Float[Array, "..."] | None = eqx.field(default=None, metadata=RECORD)
+    elapsed: ArrayLike | None = eqx.field(default=None, metadata=RECORD)
 
     @classmethod
     def of(cls, t: Any, dt: ArrayLike, dtype: np.dtype | None = None) -> "Moment":
@@ -57,7 +59,7 @@ class Moment(eqx.Module):
         return to_float_time(self)
 
     def time_until(self, time: Array, rest: ArrayLike = 0.0) -> Array:
-        """How long it is until a time [s], given as a number and what its rounding left out; negative where it is over."""
+        """How long it is until a time [s], given as a number and what its rounding left out; negative where it has passed."""
         ahead = self._ahead(time, rest)
         return ahead if self.elapsed is None else ahead - self.elapsed
 
@@ -103,23 +105,23 @@ def to_float_time(t: Any) -> Any:
 
 
 def time_for_part(part: Any, t: Any) -> Any:
-    """The time as a part of a scene is told it: the moment itself only if it asks for moments, as those of the library."""
+    """The time as a part of a scene gets it: the moment itself only if it asks for moments, as those of the library do."""
     return t if getattr(part, "sees_moments", False) is True else to_float_time(t)
 
 
 def time_for_method(method: Any, t: Any) -> Any:
-    """The time as a method is told it, which may have another inside: a user's gets a float."""
+    """The time as a method gets it, which may hold another: one of the user gets a float."""
     inner = getattr(method, "method", None)
     return t if is_library_part(method) and (inner is None or is_library_part(inner)) else to_float_time(t)
 
 
 def respond_at_float_time(response: Callable, motion: Callable, scene: Any, t: Any, dt: ArrayLike) -> Any:
-    """A user's response, which is told the time as a float."""
+    """A user's contact response, which gets the time as a float."""
     return response(motion, scene, to_float_time(t), dt)
 
 
 def is_library_part(part: Any) -> bool:
-    """Whether a function or a module is the library's own, which may be told a moment instead of a float."""
+    """Whether a function or a module is the library's own, which may get a moment instead of a float."""
     return getattr(getattr(part, "function", part), "__module__", "").startswith("physjax.")
 
 
@@ -208,7 +210,7 @@ def repeat_steps(step: Callable, carry: Any, first: Array, count: int) -> Any:
     """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
     if count == 1:
         return step(first, carry)
-    if jax.config.jax_disable_jit:  # a checkpoint would trace it all the same, and hide the numbers from who looks
+    if jit_is_disabled():  # a checkpoint would trace it all the same, and hide the numbers from who looks
         return reduce(lambda carry, i: step(first + i, carry), range(count), carry)
     inner = _choose_chunk_length(count) if count > 16 else count
     outer, rest = divmod(count, inner)

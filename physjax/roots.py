@@ -1,4 +1,4 @@
-"""Roots lane by lane, which move with what the function depends on."""
+"""Roots of one unknown, lane by lane; their derivatives follow by the implicit function theorem."""
 
 from collections.abc import Callable
 from functools import partial

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -25,7 +26,7 @@ SAFETY_FACTOR, LECTURE_SAFETY_FACTOR, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR 
 NEGLIGIBLE_ERROR = 1e-10
 """An error, in units of the tolerance, that counts as none."""
 SHORTEST_STEP_SHARE = 1e-6
-"""The shortest step where none is given, in parts of the dt to be subdivided."""
+"""The shortest step where none is given, relative to the dt that is subdivided."""
 
 
 class Steps(NamedTuple):
@@ -44,8 +45,8 @@ class Steps(NamedTuple):
 class Adaptive(eqx.Module):
     """A method that takes each of its steps whole and in two halves, and calls the difference its error.
 
-    Made by `adaptive`; `report` also tells the steps it took. Steps end where a force of the system jumps, and each sees
-    the mean over itself of what jumps in it: the system is asked for it, as it was before any step.
+    Made by `adaptive`; `report` also returns the steps it took. Steps end where a force of the system jumps, and each
+    sees the mean over itself of what jumps within it: the system is asked for that mean before every step.
     """
 
     method: Callable
@@ -58,11 +59,11 @@ class Adaptive(eqx.Module):
     tries: int | None = eqx.field(static=True)
 
     def __call__(self, system: System, t: Time, state: S, dt: ArrayLike) -> S:
-        """The state a dt later; not a number where the steps became shorter than allowed, or more than allowed."""
+        """The state a dt later; NaN where steps became shorter than `dt_min`, or more than `tries` were needed."""
         return self.report(system, t, state, dt).state
 
     def check_scene(self, scene: Scene) -> Scene:
-        """The scene as it is; a ValueError where something is answered once a dt, whatever the steps in it."""
+        """The scene as it is; a ValueError where a contact or a force acts once a dt, whatever the steps in it."""
         late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if f.remembers]
         late += [
             f"{type(contact).__name__} with response=contacts.project"
@@ -72,7 +73,7 @@ class Adaptive(eqx.Module):
         if late:
             raise ValueError(
                 f"adaptive: got {late[0]}, which acts once a dt and not in the steps that a tolerance chooses; expected "
-                "contacts timed by contacts.impact, and forces that forget. Use equal steps, such as methods.rk4 with a "
+                "contacts timed by contacts.impact, and forces without memory. Use equal steps, such as methods.rk4 with a "
                 "small dt."
             )
         return scene
@@ -82,7 +83,7 @@ class Adaptive(eqx.Module):
         shape, kind = read_traits(system).status_shape, leaf_dtype(state)
         dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
         floor = SHORTEST_STEP_SHARE * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
-        # less than rounding would never arrive
+        # a step below rounding would leave the time where it is
         floor = jnp.maximum(floor, 16 * jnp.finfo(kind).eps * dt)
         ceiling = dt if self.dt_max is None else jnp.minimum(self.dt_max.astype(kind), dt)
         h = jnp.clip(self._choose_first_step(system, t, state, dt), floor, ceiling)
@@ -106,9 +107,9 @@ class Adaptive(eqx.Module):
             end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
         # a dt or a tolerance that is traced cannot raise; one that is not > 0 has no end and no error
         bounds = (dt, *(b for b in (self.atol, self.rtol, self.dt_min, self.dt_max) if b is not None))
-        legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, jax.core.Tracer)]
+        legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, Tracer)]
         ok = reduce(jnp.logical_and, legal, ~end.failed & ~end.going(dt))
-        # a product and no choice: the derivatives of what is not a number are none either, where a choice would say zero
+        # a product, not `where`: the derivatives of a failed lane must be NaN as well, and `where` would make them zero
         state = jax.tree.map(
             lambda leaf: leaf * append_axes(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state
         )
@@ -141,14 +142,14 @@ class Adaptive(eqx.Module):
             accepted=walk.accepted + good.astype(jnp.int32),
             rejected=walk.rejected + bad.astype(jnp.int32),
             shortest=jnp.where(good, jnp.minimum(walk.shortest, h), walk.shortest),
-            failed=walk.failed | (bad & ~(h > floor)),  # so said, a length that is not a number ends as well
+            failed=walk.failed | (bad & ~(h > floor)),  # negated, so that a step of NaN fails as well
             last=jnp.where(good, h, walk.last),
             error=jnp.where(good, error, walk.error),
         )
 
     def _take_step(self, system: System, t: Time, state: S, h: Array) -> S:
         """One step of the method, with what jumps in time replaced by its mean over the step."""
-        # over no time there is no mean, and what is not a number would come back in a derivative
+        # the mean over no time is 0/0: NaN, which would come back in a derivative although it is not selected
         return self.method(average_over_step(system, t, jnp.where(h > 0, h, 1.0)), t, state, h)
 
     def _choose_factor(self, walk: "_Progress", h: Array, error: Array, good: Array) -> Array:
@@ -170,7 +171,7 @@ class Adaptive(eqx.Module):
             jnp.isfinite(error), jnp.clip(factor, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR), SMALLEST_STEP_FACTOR
         )
 
-    def _measure_error(self, start: S, whole: S, halves: S, shape: tuple[int, ...]) -> Array:
+    def _measure_error(self, start: PyTree, whole: PyTree, halves: PyTree, shape: tuple[int, ...]) -> Array:
         """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
         if self.error == "velocity":
             demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
@@ -231,18 +232,18 @@ def adaptive(
     keeps the halves, otherwise the step is redone; the next is 0.8 E^(-1/(p+1)) times as long, p the method's order, at
     most 5 times, and less where the error has been growing. Every independent lane has steps of its own, and all land
     exactly on the end of dt: 3 times the evaluations of the method a try, and two to begin a dt with, so give it long
-    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`); a jump of one's own that neither `averaged_over_step` nor
-    `discontinuities` tells (see `Force`) can be stepped over. Forces that remember and touches answered by
-    `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
-    Timed touches count by dt as well: a flight shorter than a quarter of dt is the last before rest, and after eight
-    touches in one dt a lane waits for the next, so take a dt in which few bounces happen.
+    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`); a force of your own that jumps and gives neither
+    `averaged_over_step` nor `discontinuities` (see `Force`) can be stepped over. Forces with memory and contacts resolved
+    by `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
+    Timed contacts are counted per dt as well: a flight shorter than a quarter of dt is the last before rest, and after
+    eight contacts in one dt a lane waits for the next, so take a dt in which few bounces happen.
 
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
-    (a millionth of dt, if not given) ends that lane as NaN: `.ok` and `.first_bad_step` of a run tell. `tries` bounds
+    (a millionth of dt, if not given) ends that lane as NaN: see `.ok` and `.first_bad_step` of a run. `tries` bounds
     the steps of one dt and makes the run differentiable in reverse; where more are needed, state and derivatives are NaN
-    as well. Symplectic methods (semi-implicit Euler, verlet, leapfrog) lose their virtue: with steps that follow the
-    state their energy drifts.
+    as well. Symplectic methods (semi-implicit Euler, verlet, leapfrog) lose their bounded energy: with steps that depend
+    on the state it drifts.
 
     Example:
         >>> careful = methods.adaptive(methods.rk4, atol=1e-5, rtol=1e-5)
@@ -252,6 +253,7 @@ def adaptive(
     """
     if not callable(method):
         raise TypeError(f"adaptive: got the method {method!r}, expected one such as methods.rk4.")
+    module = as_module(method)
     if error not in ("state", "velocity"):
         raise ValueError(f"error: got {error!r}, expected 'state' or 'velocity' (the lecture's).")
     promised = method.promises.order if isinstance(method, PromisingMethod) else None
@@ -263,10 +265,11 @@ def adaptive(
         for name, h in (("dt_min", dt_min), ("dt_max", dt_max))
     )
     known = [concrete_or_none(h) for h in (dt_min, dt_max) if h is not None]
-    if len(known) == 2 and all(h is not None for h in known) and known[0] > known[1]:
-        raise ValueError(f"dt_min: got {known[0]:g} s, which is more than dt_max {known[1]:g} s. Exchange them.")
+    shortest, longest = known if len(known) == 2 else (None, None)
+    if shortest is not None and longest is not None and shortest > longest:
+        raise ValueError(f"dt_min: got {shortest:g} s, which is more than dt_max {longest:g} s. Exchange them.")
     return Adaptive(
-        as_module(method),
+        module,
         atol,
         rtol,
         dt_min,

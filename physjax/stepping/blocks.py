@@ -17,7 +17,7 @@ from physjax.scene import Scene
 
 
 class Blocks(NamedTuple):
-    """How the lanes of a scene are cut: `count` blocks of `size`, the last one filled up with copies of the first lanes."""
+    """How the lanes of a scene are cut: `count` blocks of `size`, the last padded with copies of the first lanes."""
 
     lanes: tuple[int, ...]
     size: int
@@ -27,7 +27,7 @@ class Blocks(NamedTuple):
     def of(cls, scene: Scene, moving: Any, frame_steps: int) -> "Blocks | None":
         """The blocks for a scene, or None where they would not pay or could change its meaning.
 
-        Lanes stay together where the scene may not be cut, and where they share something that changes: `moving` are the
+        Lanes stay together where the scene may not be cut, and where they share an array that changes; `moving` are the
         arrays that a step changes.
         """
         total = math.prod(scene.state.lanes)

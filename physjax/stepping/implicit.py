@@ -6,6 +6,7 @@ simulation", 1998) it is (1 - dt ∂a/∂v - dt² ∂a/∂x) Δv = dt (a + dt �
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -40,12 +41,12 @@ MAX_HALVINGS = 8
 class ImplicitEuler(eqx.Module):
     """Implicit Euler: kick with the force at the end of the step, then drift. Stable at any step on linear springs.
 
-    Damps an oscillation by 1/√(1 + ω²dt²) a step, whether that is meant or not. Once a step the force is linearised
-    (`newton` = 0); `newton` > 0 converges the full equation in at most so many steps of Newton's method. Independent
+    Damps an oscillation by 1/√(1 + ω²dt²) a step, also where no damping is wanted. Once a step the force is linearised
+    (`newton` = 0); `newton` > 0 converges the full equation in at most `newton` steps of Newton's method. Independent
     lanes solve a small system each, coupled scenes one for each scene by at most `iterations` products with its matrix:
-    conjugate gradients where every force always pushes back (springs do, by their `linearised_at`), BiCGSTAB otherwise.
+    conjugate gradients where every force is `dissipative_symmetric` (springs are, by their `linearised_at`), BiCGSTAB otherwise.
     `tolerance` is the residual allowed, relative to dt·a, in the 2-norm weighted by mass: √ε of the float type by
-    default. A solve that does not converge raises nothing: `report` says so, with its residual. Derivatives go through
+    default. A solve that does not converge raises nothing: `report` returns its residual. Derivatives go through
     the solution, not the iterations. Raises ValueError or TypeError for bad settings.
 
     Example:
@@ -127,7 +128,7 @@ class ImplicitEuler(eqx.Module):
         def body(carry):
             u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
-            # no more digits than are still missing
+            # solving for more digits than Newton's method still misses would be wasted
             missing = jnp.sqrt(goal / jnp.where(square > 0, square, 1.0))
             change, reported = self._solve_linear(
                 step, tangent, r, jnp.clip(0.1 * missing, SMALLEST_FORCING_TERM, LARGEST_FORCING_TERM), False
@@ -173,7 +174,7 @@ class _Step(NamedTuple):
     system: System
     end: Time
     state: PyTree
-    dt: ArrayLike
+    dt: jax.Array
     kicked_leaves: tuple[bool, ...]
 
     @classmethod
@@ -212,7 +213,7 @@ class _Step(NamedTuple):
         return [jnp.zeros_like(leaf) for leaf in self.select_kicked(self.state)]
 
     def mask_held(self, u: Vector) -> Vector:
-        """u without what held lanes have of it, which is nothing: the matrix then is symmetric in them as well."""
+        """u with zero for held lanes, which do not move: the matrix is then symmetric in them as well."""
         held = read_traits(self.system).held
         return u if held is None else [scale(1 - held.astype(leaf.dtype), leaf) for leaf in u]
 
@@ -239,11 +240,11 @@ class _Step(NamedTuple):
     def _mass(self) -> jax.Array:
         """The mass of each lane; one for bodies, whose momenta are not velocities, and for a system without masses."""
         mass = read_traits(self.system).mass
-        return mass if isinstance(mass, jax.Array | np.ndarray) else jnp.ones((), self.dt.dtype)
+        return jnp.asarray(mass) if isinstance(mass, jax.Array | np.ndarray) else jnp.ones((), self.dt.dtype)
 
     def _sum(self, a: Vector, b: Vector) -> jax.Array:
         kept = len(read_traits(self.system).status_shape)
-        return sum(_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True))
+        return reduce(jnp.add, [_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True)])
 
 
 def _sum_trailing_axes(a: jax.Array, kept: int) -> jax.Array:

@@ -1,8 +1,8 @@
 """Linear systems solved without their matrix: conjugate gradients, and a method for those that are not symmetric.
 
 Unknowns are lists of arrays, many systems side by side: `inner(a, b)` gives a number for each system, and each stops by
-itself when its residual |b - A x| has fallen to `tolerance` |b|. Nothing raises: what did not converge says so in its
-residual. Not differentiable by themselves; `lax.custom_linear_solve` makes them so.
+itself when its residual |b - A x| has fallen to `tolerance` |b|. Nothing raises: a solve that did not converge has a
+larger residual. Not differentiable by themselves; `lax.custom_linear_solve` makes them so.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from physjax.vectors import scale
 
 Vector = list[Array]
 MAX_RESIDUAL_CHECKS = 4
-"""How often a system that believes it is done is looked at; in float32 it may go on from there."""
+"""How often the residual of a system that seems solved is computed again; in float32 it may have to go on from there."""
 
 
 class SolveReport(NamedTuple):
@@ -96,7 +96,7 @@ def stabilised_biconjugate_gradients(
 def _recompute_residual(
     looked: Array, matvec: Callable, b: Vector, x: Vector, r: Vector, square: Array, inner: Callable
 ) -> tuple[Vector, Array]:
-    """The residual b - A x itself, and its square, for the systems that believe they are done: what is carried along drifts."""
+    """The residual b - A x itself, and its square, for systems that seem solved: the one carried along drifts by rounding."""
 
     def true():
         share = looked.astype(b[0].dtype)
@@ -117,7 +117,7 @@ def _safe_ratio(above: Array, below: Array, going: Array) -> Array:
     return jnp.where(good, above, 0.0) / jnp.where(good, below, 1.0)
 
 
-def build_report(square: Array, size: Array, goal: Array, count: Array) -> SolveReport:
+def build_report(square: Array, size: Array, goal: ArrayLike, count: Array) -> SolveReport:
     """The report on a solve whose residual has the square `square`, of a right-hand side with the square `size`."""
     present = size > 0
     residual = jnp.sqrt(jnp.where(present, square, size) / jnp.where(present, size, 1.0))

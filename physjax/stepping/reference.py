@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import diffrax
 
 MAX_STEPS = 1_000_000
-"""Steps after which the reference gives up and says so in `.ok`."""
+"""Steps after which the reference gives up, with `.ok` False."""
 
 
 class _VectorField(eqx.Module):
@@ -36,7 +36,7 @@ class _VectorField(eqx.Module):
 def ode_term(scene: Scene) -> "diffrax.ODETerm":
     """The scene as a diffrax `ODETerm` over its state, to be used with any diffrax solver: `y0=scene.state`.
 
-    The equations of motion between steps: contacts are not in it, and parts that remember do not advance. Forces that
+    The equations of motion between steps: without contacts, and parts with memory do not advance. Forces that
     jump at known times (`Kick`) need `ClipStepSizeController(jump_ts=discontinuities(scene))`.
 
     Example:
@@ -82,7 +82,7 @@ def reference(
     as_real_quantity("atol", atol, above=0.0)
     if scene.emitter is not None or scene.remembers:
         raise ValueError(
-            "reference: the scene has parts that remember, which an ordinary differential equation has not. Remove them."
+            "reference: the scene has parts with memory, which an ordinary differential equation has not. Remove them."
         )
     if scene.contacts:
         raise ValueError(
@@ -135,8 +135,11 @@ def solve_ode(
     """
     import diffrax
 
-    norm = {"norm": _max_norm} if strict else {}
-    controller = diffrax.PIDController(rtol=rtol, atol=atol, **norm)
+    controller = (
+        diffrax.PIDController(rtol=rtol, atol=atol, norm=_max_norm)
+        if strict
+        else diffrax.PIDController(rtol=rtol, atol=atol)
+    )
     jumps = discontinuities(scene)
     if jumps.size or strict:
         controller = diffrax.ClipStepSizeController(

@@ -1,8 +1,8 @@
 """The loop: repeat a scene's step, keep frames, count time.
 
-The number of steps is shape (a scan, which can be differentiated); dt and every physical number are not, so changing
-them compiles nothing. Reverse mode keeps the state at the frames and recomputes between them in nested scans: memory
-O(frames + √save_every).
+The number of steps is part of the program's shape (a scan, which can be differentiated); dt and every physical number
+are data, so that changing them recompiles nothing. Reverse mode keeps the state at the frames and recomputes between
+them in nested scans: memory O(frames + √save_every).
 """
 
 import functools
@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
@@ -45,7 +46,7 @@ def simulate(
 
     Give `steps`, or a `duration` [s] that is a multiple of `dt` [s]. `dt` is a scalar or shaped like
     `scene.status_shape`. Frame 0 is the start. `record=f(t, state)` keeps only that instead of the whole state; name
-    the function once, a new one compiles anew. `first_step` continues the count of time: `simulate(flight.final_scene,
+    the function once, a new one recompiles. `first_step` continues the count of time: `simulate(flight.final_scene,
     ..., first_step=flight.final_step)` resumes a run, up to step 2³¹ - 1. Under jit, vmap, jvp and grad as well. Raises
     ValueError or TypeError for bad numbers; a run that blows up does not raise, it returns with `.ok` False and
     `.first_bad_step`.
@@ -139,12 +140,12 @@ def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
 
 
 def _is_compile_bound(scene: Scene) -> bool:
-    """Whether compiling is what a run costs: few lanes, and contacts that remember."""
+    """Whether compiling costs more than running: few lanes, and contacts with memory, which are many small kernels."""
     return math.prod(scene.state.lanes) < MIN_LANES_TO_SELECT and any(contact.memory for contact in scene.contacts)
 
 
 def _is_untransformed(run: tuple) -> bool:
-    """Whether a run is compiled by itself: nothing in it is traced, and no part of the user's hides a tracer."""
+    """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
     scene, method, *_ = run
     path = () if scene.prescribed_motion is None else (scene.prescribed_motion.path,)
     source = () if scene.emitter is None else (scene.emitter.source,)
@@ -152,7 +153,7 @@ def _is_untransformed(run: tuple) -> bool:
     ours = all(
         map(_is_library_definition, (*map(type, parts), *(plain.function for plain in find_plain_functions(parts))))
     )
-    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
+    traced = any(isinstance(leaf, Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
     return ours and not traced
 
 
@@ -172,7 +173,7 @@ def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene
 def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame: ArrayLike, frames: int) -> Any:
     """States at `frames` + 1 equally spaced times, with a number of steps between them that is data, not shape.
 
-    One compilation serves every step size, which is what studies of the step need; it has no reverse mode.
+    One compilation serves every step size, as studies of the step need. A loop of a traced length has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
     changing = scene.changing()
@@ -248,7 +249,7 @@ def _check_dt(dt: ArrayLike, scene: Scene) -> Array:
 
 def _invalidate_nonpositive(duration: Array) -> Array:
     """A duration [s], NaN where it is traced and not > 0: then the run's status says so."""
-    return jnp.where(duration > 0, duration, jnp.nan) if isinstance(duration, jax.core.Tracer) else duration
+    return jnp.where(duration > 0, duration, jnp.nan) if isinstance(duration, Tracer) else duration
 
 
 def _check_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> int:
@@ -258,7 +259,7 @@ def _check_steps(steps: int | None, duration: float | None, dt: ArrayLike) -> in
         raise ValueError(f"simulate: got {given} of steps and duration, expected exactly one of them.")
     if steps is not None:
         return as_positive_integer("steps", steps)
-    if isinstance(dt, jax.core.Tracer) or isinstance(duration, jax.core.Tracer):
+    if isinstance(dt, Tracer) or isinstance(duration, Tracer):
         raise TypeError(
             "duration: dt or duration is being traced, so the number of steps is unknown. Give steps= instead."
         )

@@ -187,5 +187,5 @@ def test_parts_that_remember_are_refused():
 
     scene = Scene(Particles(jnp.zeros(2), jnp.zeros(2)), forces=(Remembers(),))
     assert simulate(scene, methods.euler, dt=0.1, steps=1).ok.all()
-    with pytest.raises(ValueError, match="parts that remember"):
+    with pytest.raises(ValueError, match="parts with memory"):
         reference(scene, TIMES)
