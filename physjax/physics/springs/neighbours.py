@@ -6,7 +6,7 @@ lattice has few offsets. In a *table* a slot has any neighbours, which are gathe
 springs that arrive at a node are kept. Both compute a spring once and apply its force at both ends.
 
 XLA on CPU fuses whatever it can, and then computes a shared term again for every one of its readers. Each
-`optimization_barrier` here is at a point where one array has many readers: nodes read by several slots, a pull read at
+`block_fusion` here is at a point where one array has many readers: nodes read by several slots, a pull read at
 both ends.
 """
 
