@@ -1,4 +1,4 @@
-"""The kerb and the hill of the gallery are surfaces: their gap grows at right angles to them, and they are drawn."""
+"""The kerb and the hill of the gallery are surfaces: their distance grows along their normals, and they are drawn."""
 
 import jax
 import numpy as np
@@ -13,12 +13,12 @@ KERB = Kerb(13.0, 0.4)
 HILL = Hill(0.4, 1.5, 20.0, 3.0)
 
 
-def slope_of_the_gap(surface, place):
+def gradient_of_the_distance(surface, place):
     return jax.vmap(jax.grad(lambda x: surface.signed_distance(0.0, x)))(place)
 
 
 @pytest.mark.parametrize(
-    ("place", "normal", "gap"),
+    ("place", "normal", "distance"),
     [
         ((5.0, 0.1, 3.0), (0.0, 1.0, 0.0), 0.1),  # above the ground
         ((12.9, 0.3, 0.0), (-1.0, 0.0, 0.0), 0.1),  # before the face
@@ -28,25 +28,25 @@ def slope_of_the_gap(surface, place):
         ((15.0, 0.3, 0.0), (0.0, 1.0, 0.0), -0.1),  # inside, nearest to the top
     ],
 )
-def test_a_kerb_is_as_far_as_the_nearest_of_its_parts(place, normal, gap):
+def test_a_kerb_is_as_far_as_the_nearest_of_its_parts(place, normal, distance):
     place = np.array([place])
-    np.testing.assert_allclose(KERB.signed_distance(0.0, place), gap, atol=1e-12)
+    np.testing.assert_allclose(KERB.signed_distance(0.0, place), distance, atol=1e-12)
     np.testing.assert_allclose(KERB.normal_at(0.0, place)[0], normal, atol=1e-12)
-    np.testing.assert_allclose(slope_of_the_gap(KERB, place)[0], normal, atol=1e-12)
+    np.testing.assert_allclose(gradient_of_the_distance(KERB, place)[0], normal, atol=1e-12)
 
 
-def test_on_a_hill_the_gap_grows_along_its_normal_and_bends_as_it_does():
+def test_on_a_hill_the_distance_grows_along_the_normal_and_curves_as_the_hill_does():
     x = np.linspace(10.0, 30.0, 101)
     place = np.stack([x, np.asarray(HILL.height(x)[0])], axis=-1)
     np.testing.assert_allclose(HILL.signed_distance(0.0, place), 0.0, atol=1e-12)
-    np.testing.assert_allclose(slope_of_the_gap(HILL, place), HILL.normal_at(0.0, place), atol=1e-12)
+    np.testing.assert_allclose(gradient_of_the_distance(HILL, place), HILL.normal_at(0.0, place), atol=1e-12)
     slope = np.asarray(HILL.height(x)[1])
     velocity = np.stack([np.full_like(x, 7.0), 7.0 * slope], axis=-1)
 
-    def gap(t, place, velocity):
+    def distance(t, place, velocity):
         return HILL.signed_distance(t, place + t * velocity)
 
-    curvature_acceleration = jax.vmap(jax.grad(jax.grad(gap)), in_axes=(None, 0, 0))(0.0, place, velocity)
+    curvature_acceleration = jax.vmap(jax.grad(jax.grad(distance)), in_axes=(None, 0, 0))(0.0, place, velocity)
     np.testing.assert_allclose(HILL.curvature_acceleration(0.0, place, velocity), curvature_acceleration, atol=1e-10)
 
 

@@ -1,7 +1,13 @@
-"""Surfaces that nothing may pass, and how a contact with them is resolved.
+"""Contact surfaces, and how contacts of particles with them are resolved.
 
-`shapes` are signed distances, `restitution` is what an impact does to a velocity, `time_of_impact` resolves a contact in its
-moment, `resting` what stays in contact, and `segments` where edges and faces come nearest.
+A surface (`surface`, `shapes`) is a signed distance with restitution and friction. Its response is `project`, at the end
+of a step, or `impact`, at the time of impact:
+
+- `time_of_impact` flies a step leg by leg (`legs`), from one event (`events`, `path_search`) to the next;
+- `impact_response` is what an event makes of a lane: `restitution` and friction, coming to rest, the end of a slide;
+- `contact_mode` decides at the start of a leg which surfaces carry a lane, and `resting` has their reactions.
+
+`segments` are contacts of edges and faces; `face` says what all this needs of a surface.
 """
 
 from physjax.physics.contacts.restitution import Coulomb

@@ -1,4 +1,6 @@
-"""What a touch does to a velocity: restitution along the normal, friction across it."""
+"""What a contact does to a velocity: restitution along the normal, friction across it."""
+
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,9 +11,12 @@ from physjax.checks import concrete_or_none, demand_all, quantity
 from physjax.particles import Particles
 from physjax.vectors import dot, scale
 
+MIN_SLIP_SPEED_SQUARED = 1e-30
+"""Slip speed² [m²/s²] below which nothing slips; it keeps the derivative of the square root finite at zero."""
+
 
 class Coulomb(eqx.Module):
-    """Dry friction: a touch holds up to μ_s times the normal impulse or force; beyond, it slips, braked by μ_k times it.
+    """Dry friction: a contact sticks up to μ_s times the normal impulse or force; beyond, it slips against μ_k times it.
 
     Example:
         >>> dry = contacts.Coulomb(static=0.6, kinetic=0.5)
@@ -32,23 +37,32 @@ class Coulomb(eqx.Module):
             )
 
     def relations(self) -> tuple[Array, ...]:
-        """What must hold between its numbers, also where they are traced."""
+        """Conditions on its numbers, checked also where they are traced."""
         return (self.kinetic <= self.static,)
 
 
+@runtime_checkable
+class Material(Protocol):
+    """What a contact needs to know of a surface besides its geometry."""
+
+    restitution: Float[Array, "..."]
+    friction: Float[Array, "..."] | None
+    coulomb: Coulomb | None
+
+
 def apply_restitution(
-    surface: eqx.Module,
+    surface: Material,
     state: Particles,
-    touch: tuple[Array, Array, Array],
+    contact: tuple[Array, Array, Array],
     inward: Float[Array, "*lanes"],
     rests: Array | None = None,
 ) -> Particles:
-    """v' = (1 - K_f) v_t - K_r v_n relative to the surface, and the position moved back to it.
+    """v' = (1 - K_f) v_t - K_r v_n relative to the surface, and the position moved back onto it.
 
-    `touch` is depth (<= 0), normal and relative velocity; `inward` (<= 0) the normal velocity of lanes that touch, 0 of
-    all others. Lanes that come to rest (`rests`) bounce no more, and keep no tangential velocity where K_f > 0.
+    `contact` is signed distance (<= 0), normal and relative velocity; `inward` (<= 0) is the normal velocity of lanes in
+    contact, 0 of all others. Lanes that come to rest (`rests`) do not bounce, nor keep tangential velocity if K_f > 0.
     """
-    depth, normal, relative = touch
+    depth, normal, relative = contact
     restitution = surface.restitution if rests is None else jnp.where(rests, 0.0, surface.restitution)
     push = (1 + restitution) * inward
     loss = _tangential_loss(surface, relative, inward, -push, rests)
@@ -61,9 +75,9 @@ def apply_restitution(
 
 
 def _tangential_loss(
-    surface: eqx.Module, relative: Array, inward: Array, impulse: Array, rests: ArrayLike | None
+    surface: Material, relative: Array, inward: Array, impulse: Array, rests: ArrayLike | None
 ) -> Array | None:
-    """The fraction of the tangential velocity that a touch takes, per lane; None for a frictionless surface.
+    """The share of the tangential velocity that a contact takes from each lane; None for a frictionless surface.
 
     `impulse` is the normal one, per unit of mass.
     """
@@ -72,8 +86,8 @@ def _tangential_loss(
         return jnp.where(inward < 0, loss, 0.0)
     if surface.coulomb is None:
         return None
-    # by Pythagoras, without the tangential vector; the floor keeps the slope of the root finite
-    speed = jnp.sqrt(jnp.maximum(dot(relative, relative) - inward * inward, 1e-30))
+    # by Pythagoras, without the tangential vector: another vector would cost several times the step
+    speed = jnp.sqrt(jnp.maximum(dot(relative, relative) - inward * inward, MIN_SLIP_SPEED_SQUARED))
     slipping = speed > surface.coulomb.static * impulse
     share = surface.coulomb.kinetic * impulse / jnp.where(slipping, speed, 1.0)
     return jnp.where(inward < 0, jnp.where(slipping, share, 1.0), 0.0)

@@ -1,18 +1,18 @@
-"""Segments and faces against surfaces: where an edge comes nearest, what a touch does to its ends, which corners touch."""
+"""Segments and flat faces against surfaces: where an edge comes nearest, how its ends respond, which corners touch."""
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.particles import Particles
+from physjax.physics.contacts.surface import Surface
 from physjax.vectors import scale
 
 
 class Nearest(NamedTuple):
-    """The point of a segment nearest to a surface: its share of the way from the first end, its place [m], its gap [m].
+    """The point of a segment nearest to a surface: its share of the way from the first end, place and distance [m].
 
     Example:
         >>> way = jnp.array([0.0, 2.0]), jnp.array([4.0, 2.0])
@@ -27,7 +27,7 @@ class Nearest(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """A flat face set down: the gap of each corner [m], and which of them touch.
+    """The corners of a flat face at a surface: the signed distance of each [m], and which of them touch.
 
     Example:
         >>> feet = jnp.array([[0.0, 0.0], [1.0, 0.5]])
@@ -41,9 +41,9 @@ class Corners(NamedTuple):
 
 
 def nearest_on_segment(
-    surface: eqx.Module, t: ArrayLike, start: Float[Array, "*lanes dim"], end: Float[Array, "*lanes dim"]
+    surface: Surface, t: ArrayLike, start: Float[Array, "*lanes dim"], end: Float[Array, "*lanes dim"]
 ) -> Nearest:
-    """The deepest point of the segment from `start` to `end` [m]: an end, or for a ball or a slab a point between them.
+    """The deepest point of the segment from `start` to `end` [m]: an end, or at a ball or a slab a point in between.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0))
@@ -64,16 +64,16 @@ def nearest_on_segment(
 
 
 def respond_segment(
-    surface: eqx.Module,
+    surface: Surface,
     t: ArrayLike,
     start: Particles,
     end: Particles,
     masses: tuple[ArrayLike, ArrayLike] = (1.0, 1.0),
 ) -> tuple[Particles, Particles]:
-    """The two ends of a segment after a touch of its deepest point, which answers like a particle there.
+    """The two ends of a segment after a contact at its deepest point, which responds like a particle there.
 
-    The push goes to the ends by their leverage: an end of mass m at the share w of the touch takes w/m of it. Momentum
-    changes along the surface's push alone, and a perfect bounce keeps the energy. `masses` [kg] are scalars or per lane.
+    The impulse is shared by leverage: an end of mass m and weight w at the contact point takes w/m of it. Momentum changes
+    along that impulse alone, and an elastic bounce keeps the energy. `masses` [kg] are scalars or per lane.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0))
@@ -95,9 +95,9 @@ def respond_segment(
 
 
 def touching_corners(
-    surface: eqx.Module, t: ArrayLike, corners: Float[Array, "*lanes corners dim"], tolerance: ArrayLike = 1e-9
+    surface: Surface, t: ArrayLike, corners: Float[Array, "*lanes corners dim"], tolerance: ArrayLike = 1e-9
 ) -> Corners:
-    """A face of flat corners [m] against a flat surface: none, one, an edge or all of them touch, within `tolerance` [m].
+    """Which corners [m] of a flat face touch a flat surface within `tolerance` [m]: none, one, an edge or all.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0))

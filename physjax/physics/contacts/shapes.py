@@ -1,27 +1,35 @@
-"""Surfaces that particles may not pass: each shape is a signed distance, and the answer to a touch is written once for all.
+"""The shapes of contact surfaces: plane, slab, sphere and room, each given by its signed distance.
 
-`signed_distance` [m] is positive on the legal side, zero on the surface, negative on the wrong side; `normal_at` points to the legal side.
-Shapes may move with a constant `velocity` [m/s] from where they are at t = 0 (a piston, a bat).
+`signed_distance` [m] is positive on the legal side, zero on the surface and negative on the wrong side; `normal_at`
+points to the legal side. Shapes may move with a constant `velocity` [m/s] from where they are at t = 0 (a piston, a
+bat). The contact response is the same for all of them and stands in `surface`.
 """
 
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import concrete_or_none, demand_all, demand_direction, quantity
 from physjax.cubics import Cubic
-from physjax.particles import Particles
-from physjax.physics.contacts.surface import INHERITED_FIELDS, Surface
+from physjax.particles import Particles, sum_terms
+from physjax.physics.contacts.face import LowestPoint
+from physjax.physics.contacts.surface import Surface
 from physjax.vectors import broadcast_vector, dot, norm, scale, unit
 
-_SMALLEST_LENGTH_SQUARED = 1e-30
+R = TypeVar("R", bound="Room")
+
+SMALLEST_LENGTH_SQUARED = 1e-30
+"""Length² [m²] of a segment below which it is a point: it stands in for a zero that would be divided by."""
+VELOCITY_ROUNDING = 4
+"""Units of rounding below which a plane's velocity along its own normal is the zero that it is meant to be."""
 
 
 class Plane(Surface):
-    """A floor, a wall, a slope: legal is (X - P)·N > 0. The normal N is made a unit vector.
+    """A plane, for a floor, a wall or a slope: (X - P)·N > 0 is legal. The normal N is scaled to length 1.
 
     Example:
         >>> slope = contacts.Plane(point=(0.0, 5.0), normal=(3.0, 4.0))
@@ -37,12 +45,12 @@ class Plane(Surface):
         demand_direction("normal of the plane", self.normal)
 
     def relations(self) -> tuple[Array, ...]:
-        """What must hold of its numbers, also where they are traced."""
+        """Conditions on its numbers, checked also where they are traced."""
         return (dot(self.normal, self.normal) > 0,)
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """(X - P)·N [m]."""
-        return self._height(t, position, self.normal_at(t, position))
+        return _measure_height(self, t, position, self.normal_at(t, position))
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """N, of length 1."""
@@ -50,9 +58,9 @@ class Plane(Surface):
 
 
 class Slab(Surface):
-    """A plate of finite thickness [m] with two legal sides, about the plane through a point.
+    """A plate of finite thickness [m], legal on both sides, with its middle plane through a point.
 
-    With `inside=True` it is a corridor of that width: legal is what lies between its faces.
+    With `inside=True` it is a corridor of that width: the space between its faces is legal.
 
     Example:
         >>> float(contacts.Slab((0.0, 0.0), (0.0, 1.0), thickness=2.0).signed_distance(0.0, ball.position))
@@ -69,7 +77,7 @@ class Slab(Surface):
         demand_direction("normal of the slab", self.normal)
 
     def relations(self) -> tuple[Array, ...]:
-        """What must hold of its numbers, also where they are traced."""
+        """Conditions on its numbers, checked also where they are traced."""
         return (dot(self.normal, self.normal) > 0,)
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
@@ -83,25 +91,48 @@ class Slab(Surface):
         return scale(side, broadcast_vector(unit(self.normal), position))
 
     def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
-        """The face on the side where a lane is, as a plane: a fast lane cannot mistake it for the other."""
+        """The face on the lane's side, as a plane: a fast lane cannot mistake it for the other face."""
         if self.inside:
-            return self  # whichever face it passes, it has left
-        inherited = {name: getattr(self, name) for name in INHERITED_FIELDS}
+            return self  # a lane that passes either face has left the corridor
         normal = self.normal_at(t, position)
-        return Plane(broadcast_vector(self.point, position) + scale(self.thickness / 2, normal), normal, **inherited)
+        return Plane(
+            point=broadcast_vector(self.point, position) + scale(self.thickness / 2, normal),
+            normal=normal,
+            restitution=self.restitution,
+            friction=self.friction,
+            coulomb=self.coulomb,
+            velocity=self.velocity,
+        )
 
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
-        """Where a segment crosses the middle of the slab."""
+        """Where a segment crosses the middle plane of the slab: between two points on either side it is deepest there."""
         h0, h1 = self._height_above_middle(t, start), self._height_above_middle(t, end)
         crosses = h0 * h1 < 0
         return () if self.inside else (jnp.where(crosses, h0 / jnp.where(crosses, h0 - h1, 1.0), 0.0),)
 
-    def _height_above_middle(self, t, position):
-        return self._height(t, position, broadcast_vector(unit(self.normal), position))
+    def _height_above_middle(self, t: ArrayLike, position: Array) -> Array:
+        return _measure_height(self, t, position, broadcast_vector(unit(self.normal), position))
+
+
+def _measure_height(surface: Plane | Slab, t: ArrayLike, position: Array, normal: Array) -> Array:
+    """How far positions are above the plane through the surface's point [m].
+
+    Only the velocity along the normal moves a plane: a conveyor belt, which moves along itself, stays where it is.
+    """
+    height = dot(position - broadcast_vector(surface.point, position), normal)
+    if surface.velocity is None:
+        return height
+    velocity, normal = jnp.broadcast_arrays(surface.velocity, unit(surface.normal))
+    along = dot(velocity, normal)
+    # a belt on a slope has rounding for its velocity along the normal; over hours it would sink through the floor
+    rounding = VELOCITY_ROUNDING * float(jnp.finfo(along.dtype).eps) * dot(jnp.abs(velocity), jnp.abs(normal))
+    # what is subtracted has no derivative, so that the velocity keeps its own
+    along = along - lax.stop_gradient(jnp.where(jnp.abs(along) <= rounding, along, 0.0))
+    return height - t * along
 
 
 class Sphere(Surface):
-    """A ball in the way, or with `inside=True` a bowl that keeps what it holds.
+    """A ball as an obstacle, or with `inside=True` a bowl that holds particles inside.
 
     Example:
         >>> float(contacts.Sphere(center=(0.0, 0.0), radius=4.0).signed_distance(0.0, ball.position))
@@ -118,41 +149,47 @@ class Sphere(Surface):
         return self.radius - distance if self.inside else distance - self.radius
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-        """Away from the center, or towards it where the inside is legal; zero in the center itself."""
+        """Away from the center, or towards it where the inside is legal; zero at the center itself."""
         direction = unit(self._offset(t, position))
         return -direction if self.inside else direction
 
     def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
-        """|v_t|²/r, r from the center: along the surface a path bends away from the ball, or into the bowl."""
+        """|v_t|²/r with r the distance from the center [m/s²]; negative where the inside is legal."""
         offset = self._offset(t, position)
         distance, across = norm(offset), dot(relative, relative) - dot(relative, unit(offset)) ** 2
         across = across / jnp.where(distance > 0, distance, 1.0)
         return -across if self.inside else across
 
+    @property
+    def narrow(self) -> bool:
+        """Whether a fast point may pass through it: a ball, not a bowl."""
+        return not self.inside
+
     def may_dip(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
-        """Whether the path may enter the ball: its chord comes closer than the radius and the path's own bow together."""
+        """Whether the path may enter the ball: its chord comes closer to the center than the radius and its own sag."""
         dips = self.may_dip_as_cubic(t, dt, start, end)
         if self.inside:
             return dips
         p, chord = self._offset(t, start.position), self._offset(t + dt, end.position)
         chord = chord - p
-        bow = norm(scale(dt, self.relative(start.velocity)) - chord) + norm(
+        # a Hermite cubic is off its chord by at most a quarter of what its end velocities are off the chord's
+        sag = norm(scale(dt, self.relative(start.velocity)) - chord) + norm(
             scale(dt, self.relative(end.velocity)) - chord
         )
-        s = jnp.clip(-dot(p, chord) / jnp.maximum(dot(chord, chord), _SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
+        s = jnp.clip(-dot(p, chord) / jnp.maximum(dot(chord, chord), SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
         nearest = p + scale(s, chord)
-        # a lane that leaves the surface is nearest at its start
-        return dips | ((norm(nearest) < self.radius + bow / 4) & (s > 0))
+        # a lane that leaves the surface is nearest at its start, which is no dip
+        return dips | ((norm(nearest) < self.radius + sag / 4) & (s > 0))
 
-    def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: tuple[Array, Array]) -> tuple:
-        """The closest approach to the center: of the chord, then one Newton step on the cubic path between its ends."""
+    def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: LowestPoint) -> LowestPoint:
+        """The closest approach to the center: that of the chord, then one Newton step on the cubic path."""
         if self.inside:
             return dip
         p, q = self._offset(t, start.position), self._offset(t + dt, end.position)
         u, w = scale(dt, self.relative(start.velocity)), scale(dt, self.relative(end.velocity))
         path, chord = Cubic.through(p, q, u, w), q - p
         length = dot(chord, chord)
-        s = jnp.clip(-dot(p, chord) / jnp.maximum(length, _SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
+        s = jnp.clip(-dot(p, chord) / jnp.maximum(length, SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
         at, slope = path.at(s), path.slope(s)
         steep = dot(slope, slope) + dot(at, path.curvature(s))
         s = jnp.clip(s - jnp.where(steep > 0, dot(at, slope) / jnp.where(steep > 0, steep, 1.0), 0.0), 0.0, 1.0)
@@ -161,17 +198,18 @@ class Sphere(Surface):
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
         """The foot of the perpendicular from the center."""
         p, along = self._offset(t, start), end - start
-        return (jnp.clip(-dot(p, along) / jnp.maximum(dot(along, along), _SMALLEST_LENGTH_SQUARED), 0.0, 1.0),)
+        return (jnp.clip(-dot(p, along) / jnp.maximum(dot(along, along), SMALLEST_LENGTH_SQUARED), 0.0, 1.0),)
 
-    def _offset(self, t, position):
+    def _offset(self, t: ArrayLike, position: Array) -> Array:
+        """From the center to positions [m]."""
         return self._to_rest_frame(t, position) - broadcast_vector(self.center, position)
 
 
 class Room(Surface):
-    """A closed box between two corners; every particle stays in it, in a corner too.
+    """A closed box between two corners; every particle stays inside, in the corners too.
 
-    A lane that turns around within one step, after it has come from the other half of the room, is seen to touch only if
-    it ends outside: take steps in which no lane flies up from the floor, touches the ceiling and comes back.
+    A lane that crosses the middle of the room and turns around within one step is found in contact only if it ends
+    outside: take steps in which no lane flies up from the floor, touches the ceiling and comes back.
 
     Example:
         >>> float(contacts.Room((-4.0, 0.0), (7.0, 12.0)).signed_distance(0.0, ball.position))
@@ -190,33 +228,45 @@ class Room(Surface):
             )
 
     def relations(self) -> tuple[Array, ...]:
-        """What must hold between its numbers, also where they are traced."""
+        """Conditions on its numbers, checked also where they are traced."""
         return (self.upper > self.lower,)
 
     def walls(self) -> tuple[Slab, ...]:
         """A corridor along each axis, between two opposite walls."""
-        inherited = {name: getattr(self, name) for name in INHERITED_FIELDS}
         middle, width = (self.lower + self.upper) / 2, self.upper - self.lower
         axes = jnp.eye(self.lower.shape[-1], dtype=self.lower.dtype)
-        pairs = [Slab(middle, axis, width[..., i], inside=True, **inherited) for i, axis in enumerate(axes)]
+        pairs = [self._build_wall_pair(middle, axis, width[..., i]) for i, axis in enumerate(axes)]
         if self.touching_since is None:
             return tuple(pairs)
         return tuple(pair.remember_since([self.touching_since[..., i]]) for i, pair in enumerate(pairs))
 
-    def remember_since(self, since: list[Array]) -> "Room":
-        """The room with another memory of when each lane began to touch a wall, the wall's axis last."""
+    def _build_wall_pair(self, middle: Array, axis: Array, width: Array) -> Slab:
+        """The two walls across an axis, as a corridor."""
+        return Slab(
+            point=middle,
+            normal=axis,
+            thickness=width,
+            inside=True,
+            restitution=self.restitution,
+            friction=self.friction,
+            coulomb=self.coulomb,
+            velocity=self.velocity,
+        )
+
+    def remember_since(self: R, since: list[Array]) -> R:
+        """The room with new times [s] since when each lane is in contact with a wall, the wall's axis last."""
         return super().remember_since([jnp.stack(since, axis=-1)])
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearest wall [m]; outside, to the farthest one that was passed."""
-        gaps = [wall.signed_distance(t, position) for wall in self.walls()]
-        return jnp.min(jnp.stack(gaps), axis=0)
+        distances = [wall.signed_distance(t, position) for wall in self.walls()]
+        return jnp.min(jnp.stack(distances), axis=0)
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """The normal of the nearest wall."""
         nearest = jnp.argmin(jnp.stack([wall.signed_distance(t, position) for wall in self.walls()]), axis=0)
         normals = [wall.normal_at(t, position) for wall in self.walls()]
-        return sum(scale((nearest == i).astype(position.dtype), n) for i, n in enumerate(normals))
+        return sum_terms([scale((nearest == i).astype(position.dtype), n) for i, n in enumerate(normals)])
 
     def may_meet(
         self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
@@ -226,7 +276,7 @@ class Room(Surface):
         return jnp.any(jnp.stack(flags), axis=0)
 
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
-        """Wall by wall: in a corner two or three of them answer."""
+        """Wall by wall: in a corner two or three of them respond."""
         for wall in self.walls():
             state = wall.respond(t, state)
         return state

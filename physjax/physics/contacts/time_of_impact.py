@@ -1,46 +1,57 @@
-"""Time of impact: each touch is found inside the step, answered there, and the rest of the step goes on from it.
+"""Time of impact: each contact is found within the step and resolved there, and the rest of the step goes on from it.
 
-What a touch is, and what follows, is decided lane by lane; only the lanes that touch something are computed again. The
-moment is a root of the signed distance along the method's own path, so a method keeps its order through a bounce; it
-moves with every parameter, so that derivatives through a bounce are right, forward and reverse.
+The time is a root of the signed distance along the method's own path, so that a method keeps its order through a bounce.
+It moves with every parameter, so that derivatives through a bounce are right, forward and reverse. All is decided lane
+by lane, and only the lanes that meet something are computed again.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from physjax.backend import any_lane, compact_and_apply, materialise_where
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
+from physjax.physics.contacts.contact_mode import (
+    ContactMode,
+    apply_contact_mode,
+    decide_contact_mode,
+    make_free_mode,
+)
 from physjax.physics.contacts.events import Event, collect_faces, evaluate_guards, find_next_event
-from physjax.physics.contacts.resting import ContactMode, apply_contact_mode, decide_contact_mode, make_free_mode
-from physjax.physics.contacts.restitution import apply_restitution
+from physjax.physics.contacts.face import ContactFace
+from physjax.physics.contacts.impact_response import resolve_contact
+from physjax.physics.contacts.legs import (
+    MAX_IMPACTS,
+    Flight,
+    Motion,
+    choose_lanes,
+    invalidate_lanes,
+    is_overrun,
+    shortest_duration,
+)
 from physjax.roots import find_first_root
 from physjax.scene import Scene, trace_once
-from physjax.vectors import dot
 
-MAX_IMPACTS = 8
-"""Touches that one lane may have within one step; after so many it stays where it is, with its velocity, until the next."""
-SHORTEST_FLIGHT_SHARE = 0.25
-"""A bounce whose flight would be shorter than this share of the step is the last: what would follow is summed."""
+Total = TypeVar("Total")
+Walls = tuple[ContactFace, ...]
+"""The surfaces of a scene that are resolved at the time of impact."""
 
 
 @trace_once
-def impact(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
-    """The response that finds when each lane touches within the step, bounces it there, and goes on from there.
+def impact(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
+    """The response that finds the time of each impact within the step, bounces the lane there, and goes on from there.
 
-    For independent lanes. At most 8 touches a lane and step: a lane that would touch yet more often waits where it is,
-    energy and all, for the next step, so nothing ever passes; where a moving surface comes over it as it waits, it
-    becomes NaN, which its status tells. When a flight to the next bounce would be shorter than a
-    quarter of a step, the lane comes to rest: the bounces that remain take 2v/(g(1 - K_r)) more, which
-    `touching_since` records. From then on it is held by the surface, lies still or slides, until a force lifts it off.
+    For independent lanes, at most 8 impacts per lane and step. A lane that would have more waits where it is, with its
+    velocity, for the next step, so that nothing ever passes; where a moving surface overruns it as it waits, it becomes
+    NaN, which its status reports. Where the flight to the next bounce would be shorter than a quarter of a step, the
+    lane comes to rest: the bounces that remain take 2v/(g(1 - K_r)) more, which `touching_since` [s] records. From then
+    on the surface carries it, at rest or sliding, until a force lifts it off.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.impact)
@@ -50,10 +61,10 @@ def impact(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
         [0.  0.5] [0. 1.]
     """
     walls = _collect_walls(scene)
-    since = tuple(wall.touching_since for wall in walls)
-    # a lane that is lost rests nowhere: the others must not take another path, in other roundings, because of it
+    since = _list_contact_starts(walls)
+    # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
     any_contact = any_lane(jnp.any(jnp.isfinite(jnp.stack(since)), axis=0) & scene.finite(scene.state))
-    # a branch also keeps the step apart from what reads it: XLA would compute it again in every reader
+    # the branch also keeps XLA from computing the step again in everything that reads its result
     end, since = lax.cond(
         any_contact,
         lambda: _step_in_contact(motion, scene, since, any_contact, t, dt),
@@ -71,9 +82,9 @@ def impact(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
 
 
 def _step_in_contact(
-    motion: Callable, scene: Scene, since: tuple, any_contact: Array, t: Time, dt: ArrayLike
-) -> tuple[Particles, tuple]:
-    """A step in which surfaces hold some lanes."""
+    motion: Motion, scene: Scene, since: tuple[Array, ...], any_contact: Array, t: Time, dt: ArrayLike
+) -> tuple[Particles, tuple[Array, ...]]:
+    """A step in which surfaces carry some lanes."""
     walls = _collect_walls(scene)
     start = materialise_where(
         any_contact, lambda: decide_contact_mode(scene, walls, since, t, dt), make_free_mode(scene, walls, since)
@@ -81,19 +92,19 @@ def _step_in_contact(
     return motion(apply_contact_mode(scene, walls, start), t, dt).state, start.since
 
 
-def _may_meet(scene: Scene, since: tuple, end: Particles, t: ArrayLike, dt: ArrayLike) -> Array:
-    """Lanes that may meet something within the step: cheap, and never wrong about one that does not."""
+def _may_meet(scene: Scene, since: tuple[Array, ...], end: Particles, t: ArrayLike, dt: ArrayLike) -> Array:
+    """Which lanes may meet something within the step: cheap, and true of every lane that does."""
     scene, since, end = lax.stop_gradient((scene, since, end))
-    flags, since = [], list(since)
+    flags, remaining = [], list(since)
     for contact in scene.contacts:
         if contact.response is impact:
-            touching = [jnp.isfinite(since.pop(0)) for _ in contact.walls()]
+            touching = [jnp.isfinite(remaining.pop(0)) for _ in contact.walls()]
             flags.append(contact.may_meet(touching, t, dt, scene.state, end))
     return jnp.any(jnp.stack(flags), axis=0)
 
 
 class _StepProgress(NamedTuple):
-    """How far each lane has come in a step: the time so far, its state, since when it touches what, whether it is through."""
+    """How far each lane is in a step: time so far [s], state, begin of contact with each wall [s], whether it arrived."""
 
     elapsed: Array
     state: Particles
@@ -102,13 +113,19 @@ class _StepProgress(NamedTuple):
 
 
 def _step_through_contacts(
-    motion: Callable, changing: tuple[Particles, tuple], meets: Array, scene: Scene, t: Time, dt: ArrayLike
-) -> tuple[Particles, tuple]:
-    """The step again, leg by leg from touch to touch, of lanes that may meet something; the others are where they arrived."""
+    motion: Motion,
+    changing: tuple[Particles, tuple[Array, ...]],
+    meets: Array,
+    scene: Scene,
+    t: Time,
+    dt: ArrayLike,
+) -> tuple[Particles, tuple[Array, ...]]:
+    """The step again, leg by leg from impact to impact, of lanes that may meet something; the others have arrived."""
     leg, dt = _start_progress(scene, dt)
     state, since = choose_lanes(meets, (leg.state, leg.since), changing)
     leg = leg._replace(state=state, since=since, arrived=~meets)
 
+    # a scan of fixed length and not a while loop, so that reverse mode goes through; a leg that no lane needs is a branch
     def go_on(leg, _):
         more = any_lane(~leg.arrived)
         return lax.cond(
@@ -120,7 +137,7 @@ def _step_through_contacts(
 
 
 def _invalidate_overrun_lanes(scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> Particles:
-    """The lanes after a step; those that waited in it where a surface has moved over them are not finite any more."""
+    """The lanes after a step; those that wait where a surface has moved over them become NaN."""
 
     def overrun():
         leg_start = t + leg.elapsed
@@ -134,36 +151,17 @@ def _invalidate_overrun_lanes(scene: Scene, leg: _StepProgress, t: Time, dt: Arr
     return invalidate_lanes(materialise_where(~leg.arrived, overrun), leg.state)
 
 
-def is_overrun(surfaces: list, leg_start: Array, ended: Array, state: Any) -> Bool[Array, "*lanes"]:
-    """Whether a surface moves over a lane that stays where it is from one moment [s] to another."""
-    x = lax.stop_gradient(state.position)
-    rounding = 64 * float(jnp.finfo(x.dtype).eps) * jnp.sqrt(dot(x, x))
-    over = jnp.zeros(rounding.shape, bool)
-    for surface in surfaces:
-        before, after = (lax.stop_gradient(surface.clearance(t, state)) for t in (leg_start, ended))
-        over = over | ((after < -rounding) & (after < before - rounding))
-    return over
-
-
-def invalidate_lanes(overrun: Bool[Array, "*lanes"], state: Any) -> Any:
-    """The state with NaN in the lanes that are lost: their status tells, and they harm no other."""
-    return jax.tree.map(lambda leaf: jnp.where(overrun[..., None], jnp.nan, leaf), state)
-
-
 def _start_progress(scene: Scene, dt: ArrayLike) -> tuple[_StepProgress, Array]:
     """Where the first leg of a step begins, and the step of each lane."""
     dt = jnp.broadcast_to(dt, scene.state.lanes)
-    since = tuple(wall.touching_since for wall in _collect_walls(scene))
+    since = _list_contact_starts(_collect_walls(scene))
     return _StepProgress(jnp.zeros_like(dt), scene.state, since, jnp.zeros(dt.shape, bool)), dt
 
 
 def _begin_leg(scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> tuple[Time, Array, ContactMode]:
-    """When a leg begins, how much of the step is left, and what carries each lane through it."""
-    walls, leg_start, rest = (
-        _collect_walls(scene),
-        t + leg.elapsed,
-        jnp.maximum(dt - leg.elapsed, shortest_duration(dt)),
-    )
+    """When a leg begins [s], how much of the step is left [s], and each lane's contact mode for it."""
+    walls, leg_start = _collect_walls(scene), t + leg.elapsed
+    rest = jnp.maximum(dt - leg.elapsed, shortest_duration(dt))
     here = scene.replace(state=leg.state)
     start = materialise_where(
         ~leg.arrived,
@@ -173,8 +171,8 @@ def _begin_leg(scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> tuple[Ti
     return leg_start, rest, start
 
 
-def _advance_leg(motion: Callable, scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> _StepProgress:
-    """From where the lanes are to the first touch of each, or to the end of the step."""
+def _advance_leg(motion: Motion, scene: Scene, leg: _StepProgress, t: Time, dt: Array) -> _StepProgress:
+    """From where the lanes are to the next event of each, or to the end of the step."""
     walls, going = _collect_walls(scene), ~leg.arrived
     leg_start, rest, start = _begin_leg(scene, leg, t, dt)
     held = apply_contact_mode(scene, walls, start)
@@ -182,40 +180,24 @@ def _advance_leg(motion: Callable, scene: Scene, leg: _StepProgress, t: Time, dt
     event = materialise_where(going, lambda: find_next_event(walls, start, end, to_float_time(leg_start), rest))
     through = _StepProgress(leg.elapsed + rest, end, start.since, jnp.ones_like(leg.arrived))
 
-    def touch():
+    def resolve():
+        # the step to the end of the leg, flown again only as far as the event
         duration = jnp.maximum(_find_event_time(motion, held, start, event, leg_start, rest), shortest_duration(dt))
-        touched = leg_start + duration
         at = materialise_where(event.hit, lambda: motion(held, leg_start, duration).state, leg.state)
         state, since = materialise_where(
-            event.hit, lambda: _resolve_contact(held, start, event, leg_start, touched, at, dt), (leg.state, leg.since)
+            event.hit,
+            lambda: resolve_contact(held, walls, start, event, leg_start, leg_start + duration, at, dt),
+            (leg.state, leg.since),
         )
         return choose_lanes(event.hit, _StepProgress(leg.elapsed + duration, state, since, leg.arrived), through)
 
-    return lax.cond(any_lane(event.hit), touch, lambda: through)
+    return lax.cond(any_lane(event.hit), resolve, lambda: through)
 
 
-class Flight(NamedTuple):
-    """A leg of a step, from one touch to the next, as it was flown.
-
-    `before` is the state that the touch before it left, `scene` begins with what the surfaces made of that and carries
-    their reactions; `leg_start` [s] and `duration` [s] are of each lane; `end` is where the method came, `after` what the
-    touch there made of it. Lanes that are not `active` had arrived before.
-    """
-
-    before: Particles
-    scene: Scene
-    leg_start: Time
-    duration: Array
-    end: Particles
-    after: Particles
-    active: Bool[Array, "*lanes"]
-
-
-def fold_flights(motion: Callable, scene: Scene, t: Time, dt: ArrayLike, add: Callable, total: Any) -> Any:
-    """The legs of the step that `impact` takes, told one by one: `total = add(total, flight)`, folded over them.
-
-    Returns the total and the state after the step.
-    """
+def fold_flights(
+    motion: Motion, scene: Scene, t: Time, dt: ArrayLike, add: Callable[[Total, Flight], Total], total: Total
+) -> tuple[Total, Particles]:
+    """The total of `total = add(total, flight)` over the legs of the step that `impact` takes, and the state after it."""
     leg, dt = _start_progress(scene, dt)
 
     def fly(leg, total):
@@ -233,58 +215,16 @@ def fold_flights(motion: Callable, scene: Scene, t: Time, dt: ArrayLike, add: Ca
     return total, _invalidate_overrun_lanes(scene, leg, t, dt)
 
 
-def shortest_duration(dt: Array) -> Array:
-    """The shortest stretch of time: none is quite zero, so that a mean over it is still a mean."""
-    return float(jnp.finfo(dt.dtype).eps) * dt
-
-
-def _resolve_contact(
-    scene: Scene, start: ContactMode, event: "Event", leg_start: Time, t: Time, at: Particles, dt: Array
-) -> tuple[Particles, tuple]:
-    """State and memory after the touches: a bounce, coming to rest, or the end of a slide."""
-    walls, acceleration, t = _collect_walls(scene), scene.acceleration(t, at), to_float_time(t)
-    faces = collect_faces(walls, to_float_time(leg_start), start.state)
-    guards = jnp.stack(evaluate_guards(faces, walls, start, event, t, at))
-    which = jnp.argmin(guards, axis=0)
-    # a path that only just misses, though the cubic touched, goes on as it was
-    eps = float(jnp.finfo(at.dtype).eps)
-    reached = 64 * eps * jnp.sqrt(dot(at.position, at.position)) + eps**0.5 * (event.above - event.below)
-    touches = event.hit & (jnp.min(guards, axis=0) <= lax.stop_gradient(reached))
-    state, since = at, list(start.since)
-    # one guard a lane: each answer starts from the same state, and is taken where it applies
-    for i, wall in enumerate(faces):
-        here = touches & (which == i)
-        normal, relative = wall.normal_at(t, at.position), wall.relative(at.velocity)
-        inward = jnp.where(here, jnp.minimum(dot(relative, normal), 0.0), 0.0)
-        lift = wall.restitution * -inward
-        weight = -(dot(acceleration, normal) + wall.curvature_acceleration(t, at.position, relative))
-        rests = here & (2 * lift <= SHORTEST_FLIGHT_SHARE * dt * weight) & ((wall.restitution < 1) | (lift == 0))
-        touch = (wall.signed_distance(t, at.position), normal, relative)
-        state = choose_lanes(here, apply_restitution(wall, at, touch, inward, rests), state)
-        flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - wall.restitution), 1.0)
-        since[i] = jnp.where(rests, t + flights, since[i])
-    slides = [i for i, slip in enumerate(start.slip) if slip is not None]
-    for guard, i in enumerate(slides, start=len(walls)):
-        relative, before = walls[i].relative(at.velocity), walls[i].relative(start.state.velocity)
-        slowed = dot(relative, relative) < 0.25 * dot(before, before)  # else it only turned
-        stopped = Particles(at.position, at.velocity - relative)
-        state = choose_lanes(touches & (which == guard) & slowed, stopped, state)
-    bounced, load_speed_squared = touches & (which < len(walls)), dot(acceleration, acceleration) * (dt * dt)
-    for i, wall in enumerate(walls):
-        # a bounce elsewhere throws a lane off what it touched, or into it: then that is a new touch
-        since[i] = jnp.where(
-            bounced & (which != i) & _is_leaving(wall, t, state, load_speed_squared), jnp.inf, since[i]
-        )
-    return state, tuple(since)
-
-
 def _find_event_time(
-    motion: Callable, scene: Scene, start: ContactMode, event: Event, leg_start: Time, rest: Array
+    motion: Motion, scene: Scene, start: ContactMode, event: Event, leg_start: Time, rest: Array
 ) -> Array:
-    """When the first guard reaches zero on the method's own path [s after `leg_start`]; differentiable."""
+    """When the first guard reaches zero on the method's own path [s after `leg_start`]; differentiable.
+
+    The bracket comes from the cubic, and has no derivatives: those of the root follow from the guard's own.
+    """
     event, rest = lax.stop_gradient((event, rest))
 
-    def nearest(duration, scene, start, event, leg_start):
+    def find_smallest_guard(duration, scene, start, event, leg_start):
         state, walls = motion(scene, leg_start, duration).state, _collect_walls(scene)
         faces = collect_faces(walls, to_float_time(leg_start), start.state)
         return jnp.min(
@@ -292,32 +232,25 @@ def _find_event_time(
         )
 
     bracket = (event.first * rest, jnp.minimum(event.last, 1.0) * rest)
+    # beyond this the time itself is not resolved
     tolerance = 4 * float(jnp.finfo(rest.dtype).eps) * rest
     search = (bracket, (event.above, event.below), event.hit, tolerance)
-    return find_first_root(nearest, (scene, start, event, leg_start), search)
+    return find_first_root(find_smallest_guard, (scene, start, event, leg_start), search)
 
 
-def _collect_walls(scene: Scene) -> tuple:
-    """The surfaces that answer at the moment of impact, rooms taken apart."""
+def _collect_walls(scene: Scene) -> Walls:
+    """The surfaces that are resolved at the time of impact; a room is its pairs of walls."""
     return tuple(wall for contact in scene.contacts if contact.response is impact for wall in contact.walls())
 
 
-def _is_leaving(wall: eqx.Module, t: ArrayLike, state: Particles, load_speed_squared: Array) -> Array:
-    """Whether a lane is moving off a surface, or into it, by more than rounding of its speed and of a step's `load_speed_squared`²."""
-    relative, eps = wall.relative(state.velocity), float(jnp.finfo(state.dtype).eps)
-    normal_speed = dot(relative, wall.normal_at(t, state.position))
-    return normal_speed * normal_speed > eps * dot(relative, relative) + (16 * eps) ** 2 * load_speed_squared
+def _list_contact_starts(walls: Walls) -> tuple[Array, ...]:
+    """Since when [s] each lane is in contact with each wall; a scene gives them all a memory of it."""
+    return tuple(wall.touching_since for wall in walls if wall.touching_since is not None)
 
 
-def _store_contact_starts(contacts: tuple, since: list) -> tuple:
-    """The contacts with their memory of who touches them."""
+def _store_contact_starts(contacts: tuple, since: list[Array]) -> tuple:
+    """The contacts with the times [s] since when each lane is in contact with them."""
     return tuple(
         contact.remember_since([since.pop(0) for _ in contact.walls()]) if contact.response is impact else contact
         for contact in contacts
     )
-
-
-def choose_lanes(flag: Array, a: Any, b: Any) -> Any:
-    """Lane by lane a where flagged, else b, for trees of numbers and vectors."""
-    pick = lambda x, y: jnp.where(flag if x.ndim == flag.ndim else flag[..., None], x, y)  # noqa: E731
-    return jax.tree.map(pick, a, b)

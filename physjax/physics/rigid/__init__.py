@@ -1,16 +1,17 @@
-"""Rigid bodies: how they begin, what acts on them, and how their points move.
+"""Rigid bodies: their initial state, the loads on them, and how their points move.
 
     from physjax import RigidBodies, Scene, forces, inertia, rigid
 
     brick = inertia.box(2.0, size=(0.3, 0.1, 0.2))
     thrown = Scene(rigid.bodies(brick, velocity=(5, 3, 0), angular_velocity=(0, 1, 9)), brick, (forces.Gravity(),))
 
-Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
-inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
-`ContactPoints`; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
+Forces on particles act at the center of mass, and with `AtPoint` at any point. Everything else is a `Load`: `(t,
+bodies, inertia) -> Wrench`. Points of a body are given in its own frame, from its center of mass. `ContactPoints` are
+those that can touch; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what they may not pass, and
+`Joints` hold bodies together.
 """
 
-from physjax.physics.rigid.contact_points import ContactPoints, Hull, SurfaceContact, Touch
+from physjax.physics.rigid.contact_points import ContactPoints
 from physjax.physics.rigid.joints import Joints, hinge
 from physjax.physics.rigid.loads import (
     AtPoint,
@@ -25,6 +26,7 @@ from physjax.physics.rigid.loads import (
 )
 from physjax.physics.rigid.pairs import Balls
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_acceleration, angular_velocity
+from physjax.physics.rigid.surface_contact import Hull, SurfaceContact, Touch
 
 __all__ = [
     "AtPoint",

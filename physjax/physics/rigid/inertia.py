@@ -1,10 +1,11 @@
-"""Inertia: mass, principal moments and axes of the usual solids, of points, of closed meshes, and of what is made of them.
+"""Mass, principal moments and axes of the usual solids, of point masses, of closed meshes, and of their composites.
 
 Closed forms may be traced: masses and sizes can be swept and differentiated. A full tensor is diagonalised once, on the
 host and in double precision.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,13 +25,16 @@ from physjax.physics.rigid.inertia_tensors import (
 )
 from physjax.vectors import components, dot, scale
 
+FLAT_VOLUME_SHARE = 1e-12
+"""Share of the tetrahedra's volumes below which their sum is rounding, and a mesh encloses nothing."""
+
 
 class Inertia(eqx.Module):
-    """Mass [kg] and principal moments about the centre of mass [kg m²] of rigid bodies: `mass=` of their scene.
+    """Mass [kg] and principal moments of inertia about the center of mass [kg m²]: the `mass=` of a scene of rigid bodies.
 
     `mass` is a scalar or per lane, `principal` `(3,)` or `(*lanes, 3)`, `axes` a quaternion from the principal axes to
-    the body's frame, None where they are the same. A line has no moment about itself and cannot spin about it. `about`
-    a point of itself, a body turns on a fixed pivot. Raises ValueError for numbers that no body has.
+    the body frame, None where they are the same. A line has no moment about itself and cannot spin about it. `about` puts
+    a body on a fixed pivot. Raises a ValueError for moments that no body can have.
 
     Example:
         >>> Scene(body, mass=Inertia(mass=12.0, principal=(13.0, 10.0, 5.0))).mass.principal.tolist()
@@ -43,7 +47,7 @@ class Inertia(eqx.Module):
     arm: Float[Array, "*lanes 3"] | None = unchecked_quantity("arm of the pivot", "m", kind="vector")
     pivot: Float[Array, "*lanes 3"] | None = unchecked_quantity("pivot", "m", kind="place")
 
-    def __init__(self, mass: Any, principal: Any, axes: Any = None):
+    def __init__(self, mass: ArrayLike, principal: ArrayLike | Sequence, axes: ArrayLike | Sequence | None = None):
         self.mass = as_real_quantity("mass [kg]", mass, above=0.0)
         self.principal = _check_moments(principal)
         self.axes = None if axes is None else check_quaternion("axes", axes)
@@ -57,20 +61,23 @@ class Inertia(eqx.Module):
 
     @property
     def tensor(self) -> np.ndarray:
-        """The full tensor in the body's frame [kg m²], `(*lanes, 3, 3)`, about the centre of mass or the pivot."""
+        """The full tensor in the body frame [kg m²], `(*lanes, 3, 3)`, about the center of mass or the pivot."""
         (principal,) = read_on_host("tensor", self.principal)
         tensor = principal[..., None] * np.eye(3)
-        return tensor if self.axes is None else turn_tensor(*read_on_host("axes", self.axes), tensor)
+        if self.axes is None:
+            return tensor
+        (axes,) = read_on_host("axes", self.axes)
+        return turn_tensor(axes, tensor)
 
-    def about(self, point: Any) -> "Inertia":
-        """The same body on a fixed pivot: a `point` [m] of it, in its frame, from its centre of mass.
+    def about(self, point: ArrayLike | Sequence) -> "Inertia":
+        """The same body on a fixed pivot: a `point` [m] of it, in its frame, from its center of mass.
 
-        The moments are then those about the pivot, by the parallel-axis theorem. The pivot is where that point is when
-        a scene starts, and there it stays. A point on a principal axis whose zeros can be seen, (0, 0, l), may be
-        traced; any other is worked out on the host.
+        The moments are then those about the pivot, by the parallel-axis theorem. The pivot is where that point is when a
+        scene starts, and stays there. A point on a principal axis with Python zeros elsewhere, (0, 0, l), may be traced;
+        any other is computed on the host.
         """
         if self.arm is not None:
-            raise ValueError("about: got an inertia with a pivot, expected one about the centre of mass.")
+            raise ValueError("about: got an inertia with a pivot, expected one about the center of mass.")
         parts = _split_components("pivot [m]", point)
         away = [i for i, part in enumerate(parts) if concrete_or_none(part) is None or np.any(concrete_or_none(part))]
         point = jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
@@ -82,24 +89,24 @@ class Inertia(eqx.Module):
             body = of_tensor(self.mass, self.tensor + shift_inertia(*read_on_host("pivot", self.mass, point)))
         return eqx.tree_at(lambda body: body.arm, body, -point, is_leaf=lambda leaf: leaf is None)
 
-    def validate(self, lanes: tuple[int, ...], dtype: Any) -> "Inertia":
+    def validate(self, lanes: tuple[int, ...], dtype: np.dtype) -> "Inertia":
         """The inertia of bodies in lanes of this shape, its numbers in this dtype; a ValueError where they do not fit."""
-        for name, width in (("mass", ()), ("principal", (3,)), ("axes", (4,)), ("arm", (3,))):
-            array = getattr(self, name)
+        parts = {"mass": self.mass, "principal": self.principal, "axes": self.axes, "arm": self.arm}
+        for (name, array), width in zip(parts.items(), ((), (3,), (4,), (3,)), strict=True):
             if array is not None and array.shape not in (width, (*lanes, *width)):
                 raise ValueError(f"Inertia: got {name} of shape {array.shape}, expected {width} or {(*lanes, *width)}.")
-        numbers = [None if a is None else a.astype(dtype) for a in (self.mass, self.principal, self.axes, self.arm)]
+        numbers = [None if array is None else array.astype(dtype) for array in parts.values()]
         return eqx.tree_at(
             lambda i: (i.mass, i.principal, i.axes, i.arm), self, numbers, is_leaf=lambda leaf: leaf is None
         )
 
     def place_pivot(self, pivot: Float[Array, "*lanes 3"]) -> "Inertia":
-        """The inertia with its pivot at a place of the world [m]."""
+        """The inertia with its pivot at a place in the world [m]."""
         return eqx.tree_at(lambda i: i.pivot, self, pivot, is_leaf=lambda leaf: leaf is None)
 
 
 class Solid(NamedTuple):
-    """An inertia, and where the centre of mass is in the coordinates that were given [m].
+    """An inertia, and its center of mass [m] in the coordinates in which the body was given.
 
     Example:
         >>> pair = inertia.points([1.0, 3.0], [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
@@ -165,7 +172,7 @@ def rod(mass: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
 
 
 def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int = 2) -> Inertia:
-    """A cylinder of a `length` between its ends' hemispheres, of one density.
+    """A cylinder of a `length` [m] between two hemispheres, of uniform density.
 
     With their shares of the mass, s = 4r/(3l + 4r) and 1 - s: I = (1 - s) m r²/2 + s m 2r²/5 about the axis, (1 - s)
     m (3r² + l²)/12 + s m (2r²/5 + l²/4 + 3lr/8) across.
@@ -181,11 +188,11 @@ def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int 
     return _build_axial(mass, axis, about, across)
 
 
-# by the full tensor
+# from a full tensor
 
 
 def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
-    """The inertia of a full symmetric tensor in the body's frame [kg m²], `(3, 3)` or per lane; diagonalised on the host.
+    """The inertia of a full symmetric tensor in the body frame [kg m²], `(3, 3)` or per lane; diagonalised on the host.
 
     Example:
         >>> print(inertia.of_tensor(1.0, [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 3.0]]).principal)
@@ -203,6 +210,7 @@ def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
     if (np.abs(tensor * (1 - np.eye(3))) <= rounding).all():
         return Inertia(mass, np.diagonal(tensor, axis1=-2, axis2=-1))
     principal, columns = eigh(tensor)
+    # eigenvectors come with any sign; a quaternion needs a right-handed frame
     right_handed = np.sign(np.sum(columns[..., 0] * np.cross(columns[..., 1], columns[..., 2]), axis=-1))
     principal = np.where(np.abs(principal) <= rounding[..., 0], 0.0, principal)
     return Inertia(mass, principal, find_quaternion(columns * right_handed[..., None, None]))
@@ -225,11 +233,17 @@ def points(masses: ArrayLike, positions: ArrayLike) -> Solid:
     return Solid(of_tensor(masses.sum(), shift_inertia(masses, positions - center).sum(axis=0)), center)
 
 
-def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float | None = None) -> Solid:
-    """What a closed surface of triangles encloses, by the divergence theorem; give its mass [kg] or density [kg/m³].
+def mesh(
+    vertices: ArrayLike | Sequence,
+    faces: ArrayLike | Sequence,
+    *,
+    mass: float | None = None,
+    density: float | None = None,
+) -> Solid:
+    """A solid inside a closed surface of triangles, by the divergence theorem; give its mass [kg] or density [kg/m³].
 
-    Exact for the polyhedron: a sum over the tetrahedra between each face and a point. `meshes.read_mesh` reads
-    vertices [m] and faces from a file. Raises ValueError for a mesh that is open, or whose faces do not turn alike.
+    Exact for the polyhedron: a sum over the tetrahedra between each face and a point. `meshes.read_mesh` reads vertices
+    [m] and faces from a file. Raises a ValueError for a mesh that is open, or whose faces are not oriented alike.
 
     Example:
         >>> corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -241,11 +255,12 @@ def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float
         raise ValueError("mesh: expected either mass= [kg] or density= [kg/m³].")
     vertices, faces = check_mesh(vertices, faces)
     demand_closed(faces)
+    # the point is in the middle of the vertices: far from the origin the sum would cancel
     middle = vertices.mean(axis=0)
     a, b, c = (vertices[faces[:, i]] - middle for i in range(3))
     volume = np.sum(a * np.cross(b, c), axis=-1) / 6
     whole = volume.sum()
-    if abs(whole) <= 1e-12 * np.abs(volume).sum():
+    if abs(whole) <= FLAT_VOLUME_SHARE * np.abs(volume).sum():
         raise ValueError(f"mesh: encloses a volume of {whole:g} m³, expected a body.")
     edges = np.stack([a, b, c, a + b + c])
     center = np.sum(volume[:, None] * edges[3], axis=0) / (4 * whole)
@@ -256,35 +271,34 @@ def mesh(vertices: Any, faces: Any, *, mass: float | None = None, density: float
     return Solid(of_tensor(heavy, np.trace(second) * np.eye(3) - second), middle + center)
 
 
-def composite(parts: Any) -> Solid:
-    """Bodies held together: `(inertia, position)` or `(inertia, position, orientation)` for each, by the parallel-axis theorem.
+def composite(parts: Iterable[tuple]) -> Solid:
+    """Bodies joined rigidly: `(inertia, position)` or `(inertia, position, orientation)` each, by the parallel-axis theorem.
 
-    Positions [m] of the centres of mass and orientations (quaternions) are in the frame of the whole.
+    Positions [m] of the centers of mass and orientations (quaternions) are in the frame of the whole.
 
     Example:
         >>> pair = inertia.composite([(inertia.sphere(5.0, 1.0), (0.0, 0.0, z)) for z in (-2.0, 2.0)])
         >>> print(pair.inertia.principal)
         [44. 44.  4.]
     """
-    parts = [(*part, (1.0, 0.0, 0.0, 0.0))[:3] for part in parts]
-    if not parts or any(not isinstance(body, Inertia) or body.arm is not None for body, _, _ in parts):
+    parts = list(parts)
+    bodies, places = [part[0] for part in parts], [part[1] for part in parts]
+    if not parts or any(not isinstance(body, Inertia) or body.arm is not None for body in bodies):
         raise ValueError("composite: expected (inertia, position) or (inertia, position, orientation) for each part.")
-    masses, positions = read_on_host(
-        "composite", [float(body.mass) for body, _, _ in parts], [place for _, place, _ in parts]
-    )
+    masses, positions = read_on_host("composite", [float(body.mass) for body in bodies], places)
     center = np.sum(masses[:, None] * positions, axis=0) / masses.sum()
     whole = shift_inertia(masses, positions - center).sum(axis=0)
-    for body, _, orientation in parts:
-        (q,) = read_on_host("orientation", check_quaternion("orientation", orientation))
+    for body, _, *orientation in parts:
+        (q,) = read_on_host("orientation", check_quaternion("orientation", *(orientation or [(1.0, 0.0, 0.0, 0.0)])))
         whole = whole + turn_tensor(q, body.tensor)
     return Solid(of_tensor(masses.sum(), whole), center)
 
 
-# the checks, and the host's part
+# checks, and building from a kilogram's moments
 
 
-def check_quaternion(name: str, value: Any) -> Float[Array, "*lanes 4"]:
-    """A quaternion (w, x, y, z) brought to length 1; a ValueError for zero, which turns nothing anywhere.
+def check_quaternion(name: str, value: ArrayLike | Sequence) -> Float[Array, "*lanes 4"]:
+    """A quaternion (w, x, y, z) scaled to length 1; a ValueError for zero, which is no rotation.
 
     Example:
         >>> print(inertia.check_quaternion("orientation", (3.0, 0.0, 0.0, 4.0)))
@@ -303,8 +317,8 @@ def check_quaternion(name: str, value: Any) -> Float[Array, "*lanes 4"]:
     return scale(1 / jnp.sqrt(dot(q, q)), q)
 
 
-def _split_components(name: str, vector: Any) -> list[Array]:
-    """The components of a vector one by one; written as a tuple of three, each may be traced or not."""
+def _split_components(name: str, vector: ArrayLike | Sequence) -> list[Array]:
+    """The components of a vector one by one: in a tuple of three, each may be traced or not."""
     if isinstance(vector, list | tuple) and not isinstance(vector[0], list | tuple):
         parts = [as_real_quantity(name, part) for part in vector]
     else:
@@ -314,7 +328,7 @@ def _split_components(name: str, vector: Any) -> list[Array]:
     return parts
 
 
-def _check_moments(value: Any) -> Float[Array, "*lanes 3"]:
+def _check_moments(value: ArrayLike | Sequence) -> Float[Array, "*lanes 3"]:
     """Principal moments that a body can have: none negative, none greater than the sum of the others."""
     principal = as_real_quantity("principal moments [kg m²]", value, at_least=0.0)
     if principal.shape[-1:] != (3,):
@@ -332,6 +346,7 @@ def _check_moments(value: Any) -> Float[Array, "*lanes 3"]:
 
 
 def _build_inertia(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
+    """The inertia with `factor` times the mass [kg] times these moments per kilogram [m²]."""
     mass = as_real_quantity("mass [kg]", mass, above=0.0)
     return Inertia(
         mass,
@@ -342,7 +357,7 @@ def _build_inertia(mass: ArrayLike, factor: float, *moments: Array) -> Inertia:
 
 
 def _build_axial(mass: ArrayLike, axis: int, about: Array, across: Array) -> Inertia:
-    """Moments for a kilogram about an axis of the body and across it."""
+    """The inertia with these moments per kilogram [m²] about an axis of the body frame and across it."""
     if axis not in (0, 1, 2):
         raise ValueError(
             f"axis: got {axis!r}, expected 0, 1 or 2: the axis of the body's frame that the shape is along."

@@ -1,32 +1,36 @@
-"""Inertia tensors on the host, in double precision: moved, turned and diagonalised before anything is compiled."""
+"""Inertia tensors on the host, in double precision: shifted, rotated and diagonalised before anything is compiled."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+from jax.typing import ArrayLike
 from numpy.linalg import eigh
 
 from physjax.checks import concrete_or_none
 
 
-def read_on_host(name: str, *values: Any) -> list[np.ndarray]:
+def read_on_host(name: str, *values: ArrayLike | Sequence) -> list[np.ndarray]:
     """The values in double precision; a TypeError where one is being traced."""
-    arrays = [concrete_or_none(value) for value in values]
-    if any(array is None for array in arrays):
-        raise TypeError(
-            f"{name}: is being traced, but a full tensor is diagonalised before compiling. Build it outside, or give "
-            "principal moments and axes."
-        )
-    return [array.astype(float) for array in arrays]
+    arrays = []
+    for value in values:
+        array = concrete_or_none(value)
+        if array is None:
+            raise TypeError(
+                f"{name}: is being traced, but a full tensor is diagonalised before compiling. Build it outside, or give "
+                "principal moments and axes."
+            )
+        arrays.append(array.astype(float))
+    return arrays
 
 
 def shift_inertia(mass: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """m (|d|² 1 - d dᵀ): what a mass adds that is `away` from the axes."""
+    """The parallel-axis theorem, m (|d|² 1 - d dᵀ): what a mass [kg] adds at a distance d [m] from the axes."""
     square = np.sum(away * away, axis=-1)[..., None, None] * np.eye(3)
     return mass[..., None, None] * (square - away[..., :, None] * away[..., None, :])
 
 
 def turn_tensor(q: np.ndarray, tensor: np.ndarray) -> np.ndarray:
-    """R T Rᵀ: a tensor of a frame that the unit quaternion q turns, as seen from outside."""
+    """R T Rᵀ: a tensor in the frame that the unit quaternion q rotates into."""
     matrix = rotation_matrix(q)
     half = np.sum(matrix[..., :, :, None] * tensor[..., None, :, :], axis=-2)
     return np.sum(half[..., :, None, :] * matrix[..., None, :, :], axis=-1)
@@ -44,7 +48,8 @@ def rotation_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def find_quaternion(matrix: np.ndarray) -> np.ndarray:
-    """The unit quaternion of a rotation matrix: an eigenvector, which is accurate for every angle (I. Bar-Itzhack 2000)."""
+    """The unit quaternion of a rotation matrix, as an eigenvector: accurate for every angle (I. Bar-Itzhack 2000)."""
+    # the largest eigenvalue of a symmetric 4 x 4 matrix belongs to the quaternion; formulas by the trace lose digits
     trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
     odd = matrix - np.swapaxes(matrix, -2, -1)
     first = np.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], axis=-1)
@@ -54,7 +59,7 @@ def find_quaternion(matrix: np.ndarray) -> np.ndarray:
 
 
 def demand_closed(faces: np.ndarray) -> None:
-    """Raise a ValueError unless each edge of a face is run through backwards by exactly one other."""
+    """Raise a ValueError unless each directed edge of a face is an edge of exactly one other face, backwards."""
     sides = np.concatenate([faces[:, [i, (i + 1) % 3]] for i in range(3)])
     found, counts = np.unique(sides, axis=0, return_counts=True)
     backwards = {tuple(side[::-1]) for side in found.tolist()}
@@ -64,6 +69,6 @@ def demand_closed(faces: np.ndarray) -> None:
     if bad:
         raise ValueError(
             f"mesh: {len(bad)} of {len(found)} edges, first that from vertex {bad[0][0]} to {bad[0][1]}, have no face on "
-            "the other side that turns the same way; expected a closed surface. Close it (meshes.weld "
-            "joins vertices in one place), or turn its faces alike."
+            "the other side with the same orientation; expected a closed surface. Close it (meshes.weld "
+            "joins coincident vertices), or orient its faces alike."
         )

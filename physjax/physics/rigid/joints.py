@@ -1,6 +1,7 @@
-"""Joints between bodies: stiff damped springs between points of theirs that should be one place."""
+"""Joints between rigid bodies: stiff damped springs between points that should coincide."""
 
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,9 +19,9 @@ class Joints(Load):
     """Ball joints: F = k d + c ḋ at a point of each of two bodies, d [m] from the first point to the second.
 
     `pairs` `(joints, 2)` are indices into the last lane axis, `points` `(joints, 2, 3)` the places [m] in the frames of
-    the two bodies, from their centres of mass. Stiffness k [N/m] and damping c [kg/s] are one for all. A hinge is two
-    ball joints on its axis: see `hinge`. The points part by about load/k, which `error` tells; a step must resolve
-    √(m/k) of the lightest body: the lighter and the smaller, the stiffer.
+    the two bodies, from their centers of mass. Stiffness k [N/m] and damping c [kg/s] are shared or per joint. A hinge is
+    two ball joints on its axis: see `hinge`. The points separate by about load/k, which `error` reports; a step must
+    resolve √(m/k) of the lightest body.
 
     Example:
         >>> arm = rigid.Joints([(0, 1)], [[[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]], stiffness=1e3)
@@ -29,12 +30,18 @@ class Joints(Load):
     """
 
     couples: ClassVar[bool] = True
-    points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", per="joint", above=0)
     damping: Float[Array, "..."] = quantity("damping c", "kg/s", per="joint", at_least=0)
 
-    def __init__(self, pairs: Any, points: Any, stiffness: Any, damping: Any = 0.0):
+    def __init__(
+        self,
+        pairs: ArrayLike | Sequence,
+        points: ArrayLike | Sequence,
+        stiffness: ArrayLike | Sequence,
+        damping: ArrayLike | Sequence = 0.0,
+    ):
         pairs = np.asarray(pairs)
         self.points = as_real_quantity("points of the joints [m]", points)
         whole = pairs.dtype.kind in "iu" and pairs.ndim == 2 and pairs.shape[1:] == (2,) and pairs.size
@@ -49,7 +56,7 @@ class Joints(Load):
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
-        """Forces and torques on all bodies, equal and opposite at each joint."""
+        """Forces and torques on all bodies, with equal and opposite forces at each joint."""
         arms, apart = self._locate_arms(bodies)
         straight = self._take_ends(scale(1 / inertia.mass, bodies.momentum))
         turning = self._take_ends(angular_velocity(bodies, inertia))
@@ -71,7 +78,7 @@ class Joints(Load):
         return norm(self._locate_arms(bodies)[1])
 
     def _locate_arms(self, bodies: RigidBodies) -> tuple[list[Array], Array]:
-        """From the centres of mass to the points of each joint, and from its first point to its second."""
+        """From the centers of mass to the points of each joint, and from its first point to its second [m]."""
         places = [self._take_ends(part) for part in (bodies.position, bodies.orientation)]
         arms = []
         for side, (position, orientation) in enumerate(zip(*places, strict=True)):
@@ -83,7 +90,11 @@ class Joints(Load):
         return [jnp.take(part, np.array([pair[side] for pair in self.pairs]), axis=-2) for side in (0, 1)]
 
     def _sum_by_body(self, ends: Array, bodies: RigidBodies) -> Array:
-        """What acts on the ends of joints, first ones then second ones, summed up body by body: gathered, not scattered."""
+        """What acts on the ends of joints, first ends then second ends, summed body by body.
+
+        Each body gathers its first end, its second and so on, because a scatter is slow on every device.
+        """
+        # which end of which joint each body has is known before compiling: the slots are constants of the program
         bodies_of = np.asarray(self.pairs).T.ravel()
         nodes = bodies.lanes[-1]
         slots = [np.flatnonzero(bodies_of == node) for node in range(nodes)]
@@ -96,7 +107,9 @@ class Joints(Load):
         return total
 
 
-def hinge(pair: tuple[int, int], points: Any, axis: Any, width: float) -> tuple[list, np.ndarray]:
+def hinge(
+    pair: tuple[int, int], points: ArrayLike | Sequence, axis: ArrayLike | Sequence, width: float
+) -> tuple[list[tuple[int, int]], np.ndarray]:
     """Pairs and points of a hinge for `Joints`: two ball joints a `width` [m] apart on an axis that both bodies share.
 
     `points` `(2, 3)` is its middle in each body's frame, `axis` its direction in both frames, or `(2, 3)`, one in each.

@@ -1,17 +1,6 @@
-"""Rigid bodies: how they begin, what acts on them, and how their points move.
+"""Loads on rigid bodies, their initial state, and the motion of their points."""
 
-    from physjax import RigidBodies, Scene, forces, inertia, rigid
-
-    brick = inertia.box(2.0, size=(0.3, 0.1, 0.2))
-    thrown = Scene(rigid.bodies(brick, velocity=(5, 3, 0), angular_velocity=(0, 1, 9)), brick, (forces.Gravity(),))
-
-Forces on particles act at the centre of mass, `AtPoint` wherever they should. All else is a `Load`: `(t, bodies,
-inertia) -> Wrench`. Points of a body are given in its own frame, from its centre of mass. What of a body can touch is a
-`ContactPoints`; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what it may not pass, `Joints` what holds bodies together.
-"""
-
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,18 +27,18 @@ from physjax.vectors import broadcast_vector, cross, rotate_vector, rotate_vecto
 
 def bodies(
     inertia: Inertia,
-    position: Any = (0.0, 0.0, 0.0),
-    orientation: Any = (1.0, 0.0, 0.0, 0.0),
-    velocity: Any = (0.0, 0.0, 0.0),
-    angular_velocity: Any = (0.0, 0.0, 0.0),
+    position: ArrayLike | Sequence = (0.0, 0.0, 0.0),
+    orientation: ArrayLike | Sequence = (1.0, 0.0, 0.0, 0.0),
+    velocity: ArrayLike | Sequence = (0.0, 0.0, 0.0),
+    angular_velocity: ArrayLike | Sequence = (0.0, 0.0, 0.0),
     *,
     frame: str = "world",
 ) -> RigidBodies:
-    """Bodies that begin with these velocities: p = m v, L = R I Rᵀ ω.
+    """Rigid bodies with these initial velocities: p = m v, L = R I Rᵀ ω.
 
     Vectors are `(3,)` for all or one per lane, `(*lanes, 3)`; the orientation is a quaternion (w, x, y, z) of any length,
-    the real part first: (1, 0, 0, 0) is not turned. The angular velocity [rad/s] is in the `frame` of the "world" or the
-    "body". On a pivot the velocity follows from it. The float type is the position's.
+    the real part first: (1, 0, 0, 0) is no rotation. The angular velocity [rad/s] is in the `frame` of the "world" or of
+    the "body". On a pivot the velocity follows from it. The float type is that of the position.
 
     Example:
         >>> turning = rigid.bodies(brick, angular_velocity=(0.0, 0.0, 2.0))
@@ -75,8 +64,8 @@ def bodies(
     )
 
 
-def on_bodies(function: Callable, *, couples: bool = False) -> Load:
-    """A plain function `(t, bodies, inertia) -> Wrench` as a load; say if one body's load depends on another.
+def on_bodies(function: Callable[..., Wrench], *, couples: bool = False) -> Load:
+    """A plain function `(t, bodies, inertia) -> Wrench` as a load; `couples` if one body's load depends on another body.
 
     Example:
         >>> spin_up = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(torque=0.5 * bodies.angular_momentum))
@@ -90,7 +79,7 @@ def on_bodies(function: Callable, *, couples: bool = False) -> Load:
 
 
 def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """Where a point of each body is [m]: x + R p.
+    """Position of a point of each body [m]: x + R p.
 
     Example:
         >>> print(rigid.point(body, (0.5, 0.0, 0.0)))
@@ -100,7 +89,7 @@ def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
 
 
 def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """How fast a point of each body is [m/s]: v + ω × r.
+    """Velocity of a point of each body [m/s]: v + ω × r.
 
     Example:
         >>> print(rigid.point_velocity(body, brick, (0.5, 0.0, 0.0)))
@@ -120,9 +109,10 @@ def point_acceleration(
         >>> print(rigid.point_acceleration(Scene(body, brick), 0.0, (0.5, 0.0, 0.0)))
         [-2.  0.  0.]
     """
-    state = scene.state if state is None else state
-    rate, r = scene.rate(t, state), to_world_frame(state, place)
-    omega, change = angular_velocity(state, scene.mass), angular_acceleration(state, scene.mass, rate.angular_momentum)
+    bodies = scene.state if state is None else state
+    rate, r = scene.rate(t, bodies), to_world_frame(bodies, place)
+    omega = angular_velocity(bodies, scene.mass)
+    change = angular_acceleration(bodies, scene.mass, rate.angular_momentum)
     return scale(1 / scene.mass.mass, rate.momentum) + cross(change, r) + cross(omega, cross(omega, r))
 
 
@@ -130,7 +120,7 @@ def point_acceleration(
 
 
 class Torque(Load):
-    """A torque [N m], in the frame of the "world" or of the "body".
+    """A constant torque [N m] in the frame of the "world" or of the "body".
 
     Example:
         >>> print(loads(Scene(body, brick, (rigid.Torque((0.0, 0.0, 5.0)),)), 0.0).torque)
@@ -144,7 +134,7 @@ class Torque(Load):
         _demand_frame(self.frame)
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
-        """No force, the torque."""
+        """The torque, and no force."""
         world = self.frame == "world"
         return Wrench(
             torque=broadcast_vector(self.torque, bodies.position) if world else to_world_frame(bodies, self.torque)
@@ -152,7 +142,7 @@ class Torque(Load):
 
 
 class RotationalDrag(Load):
-    """What a fluid takes from a turning body: τ = -c ω, c [N m s]; of a ball in creeping flow c = 8πηr³.
+    """Drag of a fluid on rotation: τ = -c ω, c [N m s]; for a ball in creeping flow c = 8πηr³.
 
     Example:
         >>> brake = rigid.RotationalDrag(0.5)
@@ -163,12 +153,12 @@ class RotationalDrag(Load):
     coefficient: Float[Array, "..."] = quantity("drag coefficient c", "N m s", at_least=0)
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
-        """No force, the torque."""
+        """The torque, and no force."""
         return Wrench(torque=scale(-self.coefficient, angular_velocity(bodies, inertia)))
 
 
 class Thrust(Load):
-    """A force [N] that turns with the body, at a `point` [m] of it: an engine. F = R f, τ = r × F.
+    """A force [N] fixed to the body, at a `point` [m] of it, like that of an engine: F = R f, τ = r × F.
 
     Example:
         >>> engine = rigid.Thrust((3.0, 0.0, 0.0), point=(0.0, 2.0, 0.0))
@@ -186,11 +176,11 @@ class Thrust(Load):
 
 
 class AtPoint(Load):
-    """Any force on particles, at a `point` [m] of each body: it sees where that is and how fast, and τ = r × F.
+    """Any force on particles, acting at a `point` [m] of each body, whose position and velocity it sees: τ = r × F.
 
     A spring to the world is `AtPoint(point, forces.Anchor(...))`, a spring between points of two bodies
-    `AtPoint(points, springs.Springs(pairs, ...))` with a point for each lane, a kick off centre `AtPoint(point,
-    forces.Kick(...))`. What remembers (springs that break) cannot be so placed.
+    `AtPoint(points, springs.Springs(pairs, ...))` with a point for each lane, an off-center kick `AtPoint(point,
+    forces.Kick(...))`. Forces with a memory (springs that break) cannot be used here.
 
     Example:
         >>> off_center = rigid.AtPoint((0.0, 1.0, 0.0), forces.Constant((6.0, 0.0, 0.0)))
@@ -199,7 +189,7 @@ class AtPoint(Load):
     """
 
     point: Float[Array, "..."] = quantity("point of the body", "m", kind="place")
-    force: Force = eqx.field(converter=adopt_force)
+    force: Force = eqx.field(converter=adopt_force)  # pyright: ignore[reportGeneralTypeIssues]  # `point` has no default
 
     def __check_init__(self):
         if isinstance(self.force, Load) or self.force.remembers:

@@ -1,12 +1,12 @@
-"""Rigid bodies: their state, how they turn, and what a load does to them.
+"""Rigid bodies: their state record, how loads move it, and how bodies rotate.
 
-Quaternions are (w, x, y, z), of length 1, and turn vectors of the body's frame into the world's. Angular momentum is in
-the world's frame, where nothing but a torque changes it: there is no gyroscopic term to forget. The angular velocity is
-ω = R I⁻¹ Rᵀ L, found anew from L wherever it is needed.
+Quaternions are (w, x, y, z), of length 1, and rotate vectors from the body frame to the world frame. Angular momentum is
+in the world frame, where only a torque changes it: there is no gyroscopic term to forget. The angular velocity is
+ω = R I⁻¹ Rᵀ L, computed from L wherever it is needed.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,7 +37,7 @@ from physjax.vectors import (
 
 
 class Wrench(NamedTuple):
-    """A force [N] and a torque about the centre of mass [N m], in the world's frame; None where there is none.
+    """A force [N] and a torque about the center of mass [N m], in the world frame; None where there is none.
 
     Example:
         >>> push = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(force=2.0 * bodies.momentum))
@@ -50,7 +50,7 @@ class Wrench(NamedTuple):
 
 
 class Load(Force):
-    """What acts on bodies as bodies: `(t, bodies, inertia) -> Wrench`. Other forces act at the centre of mass.
+    """A load on rigid bodies, with a torque: `(t, bodies, inertia) -> Wrench`. Other forces act at the center of mass.
 
     Example:
         >>> isinstance(rigid.Torque((0.0, 0.0, 1.0)), rigid.Load)
@@ -58,40 +58,43 @@ class Load(Force):
     """
 
     @abstractmethod
-    def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
-        """Force [N] and torque about the centre of mass [N m] on each body."""
+    def wrench(self, t: Time, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
+        """Force [N] and torque about the center of mass [N m] on each body."""
 
-    def __call__(self, t: Time, state: Any, mass: Any) -> Wrench:
-        """The wrench; a TypeError where there are no bodies."""
+    def __call__(self, t: Time, state: "RigidBodies", mass: Inertia) -> Wrench:
+        """The wrench; a TypeError for a state that is not of rigid bodies."""
         if not isinstance(state, RigidBodies):
             raise TypeError(
-                f"{type(self).__name__}: got a state of type {type(state).__name__}, expected RigidBodies: it turns what "
-                "it acts on."
+                f"{type(self).__name__}: got a state of type {type(state).__name__}, expected RigidBodies: it has "
+                "a torque."
             )
         return self.wrench(t, state, mass)
 
 
 class OnBodies(Load):
-    """A plain function `(t, bodies, inertia) -> Wrench` as a load, for each body by itself unless it `couples`."""
+    """A plain function `(t, bodies, inertia) -> Wrench` as a load, independent for each body unless it `couples`."""
 
     function: Function
     couples: bool = eqx.field(static=True)
 
-    def __init__(self, function: Callable, couples: bool = False):
+    def __init__(self, function: Callable[..., Wrench], couples: bool = False):
         self.function = Function(function)
         self.couples = couples
 
     def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
-        """What the function says."""
+        """The function's wrench."""
         return self.function(t, bodies, inertia)
 
 
 class RigidBodies(NamedTuple):
-    """Bodies that move and turn in space: position of the centre of mass [m], orientation, momentum, angular momentum.
+    """The state of rigid bodies in space: position of the center of mass [m], orientation, momentum, angular momentum.
 
-    Shapes `(*lanes, 3)`, the orientation's `(*lanes, 4)`; momentum [kg m/s] and angular momentum [kg m²/s] about the
-    centre of mass, or, for a body on a pivot, about that. `bodies` builds them from velocities. A scene of them has an
-    `Inertia` for its mass. The orientation is brought to length 1.
+    Shapes are `(*lanes, 3)`, of the orientation `(*lanes, 4)`; momentum [kg m/s] and angular momentum [kg m²/s] are about
+    the center of mass, or about the pivot of a body that has one. `bodies` builds the record from velocities. A scene of
+    rigid bodies has an `Inertia` for its mass. The orientation is normalised to length 1.
+
+    As a state record it offers what `Particles` does: `lanes` and `dtype`; `rate`, its time derivative under a wrench;
+    `kick` and `drift`, the parts of a step that change momenta and places; and `normalised`, after each step.
 
     Example:
         >>> isinstance(body, RigidBodies), body.momentum.tolist(), body.angular_momentum.tolist()
@@ -110,12 +113,12 @@ class RigidBodies(NamedTuple):
 
     @property
     def dtype(self) -> np.dtype:
-        """Floating-point type, which every number of the scene follows."""
+        """Floating-point type of the state, and of all numbers of its scene."""
         return self.position.dtype
 
     @property
     def place(self) -> np.ndarray:
-        """What the errors of a path are measured by: position [m] and orientation [1] beside each other, `(*lanes, 7)`."""
+        """What path errors are measured in: position [m] next to orientation [1], `(*lanes, 7)`."""
         return np.concatenate([self.position, self.orientation], axis=-1)
 
     @property
@@ -125,20 +128,20 @@ class RigidBodies(NamedTuple):
 
     # loads
 
-    def view_for_force(self, force: Any, mass: Inertia) -> tuple[Any, Any]:
-        """What a force sees: a load the bodies and their inertia, any other particles at the centres of mass."""
+    def view_for_force(self, force: Callable, mass: Inertia) -> tuple["RigidBodies | Particles", Inertia | Array]:
+        """State and mass that a force sees: a load the bodies and their inertia, others particles at the centers of mass."""
         if isinstance(force, Load):
             return self, mass
         return Particles(self.position, scale(1 / mass.mass, self.momentum)), mass.mass
 
-    def evaluate_load(self, force: Any, t: Time, mass: Inertia) -> Wrench:
-        """What a force does to each body: a wrench, or a force at the centre of mass."""
+    def evaluate_load(self, force: Callable, t: Time, mass: Inertia) -> Wrench:
+        """The wrench of a force on each body; a force on particles acts at the center of mass."""
         found = force(time_for_part(force, t), *self.view_for_force(force, mass))
         found = found if isinstance(found, Wrench) else Wrench(found)
         return Wrench(*(None if part is None else check_load_shape(force, part, self.position) for part in found))
 
-    def sum_loads(self, terms: Any) -> Wrench:
-        """The sum of wrenches, both parts present."""
+    def sum_loads(self, terms: Sequence[Wrench]) -> Wrench:
+        """The sum of wrenches, with both parts present."""
         kinds = zip(*terms, strict=True) if terms else ((), ())
         present = ([part for part in parts if part is not None] for parts in kinds)
         return Wrench(*(sum_terms(parts) if parts else jnp.zeros_like(self.position) for parts in present))
@@ -175,7 +178,7 @@ class RigidBodies(NamedTuple):
         )
 
     def drift(self, dt: ArrayLike, inertia: Inertia) -> "RigidBodies":
-        """x += p/m dt, and the free turn of a time dt, both momenta untouched."""
+        """x += p/m dt, and free rotation for a time dt, both momenta untouched."""
         position = self.position + scale(dt, scale(1 / inertia.mass, self.momentum))
         return self._replace(position=position, orientation=rotate_freely(self, inertia, dt)).on_pivot(inertia)
 
@@ -184,8 +187,8 @@ class RigidBodies(NamedTuple):
         return self._replace(momentum=scale(free, self.momentum), angular_momentum=scale(free, self.angular_momentum))
 
     def on_pivot(self, inertia: Inertia) -> "RigidBodies":
-        """The state with position and momentum as orientation and angular momentum say, where there is a pivot."""
-        if inertia.arm is None:
+        """The state with position and momentum that follow from orientation and angular momentum, where there is a pivot."""
+        if inertia.arm is None or inertia.pivot is None:
             return self
         arm = to_world_frame(self, inertia.arm)
         velocity = cross(angular_velocity(self, inertia), arm)
@@ -194,9 +197,9 @@ class RigidBodies(NamedTuple):
         )
 
     def normalised(self, inertia: Inertia) -> "RigidBodies":
-        """The state with the orientation of length 1, and on its pivot, where there is one.
+        """The state with the orientation scaled to length 1, and on its pivot, where there is one.
 
-        Done at the end of a step and not in its stages, which keeps every method's order.
+        A step ends with this, and none of its stages does, so that every method keeps its order.
         """
         q = self.orientation
         return self._replace(orientation=scale(1 / jnp.sqrt(dot(q, q)), q)).on_pivot(inertia)
@@ -204,7 +207,7 @@ class RigidBodies(NamedTuple):
     # what is conserved
 
     def kinetic_energy(self, inertia: Inertia) -> Float[Array, "*lanes"]:
-        """½p²/m + ½ω·L [J]; on a pivot ½ω·L is all of it."""
+        """½p²/m + ½ω·L [J]; on a pivot ½ω·L alone, which includes the motion of the center of mass."""
         turning = 0.5 * dot(angular_velocity(self, inertia), self.angular_momentum)
         return turning if inertia.arm is not None else turning + 0.5 / inertia.mass * dot(self.momentum, self.momentum)
 
@@ -213,7 +216,7 @@ class RigidBodies(NamedTuple):
         return self.momentum
 
     def own_spin(self, inertia: Inertia) -> Float[Array, "*lanes 3"]:
-        """Angular momentum about the centre of mass [kg m²/s], also where the state's own is about a pivot."""
+        """Angular momentum about the center of mass [kg m²/s], also where that of the state is about a pivot."""
         if inertia.arm is None:
             return self.angular_momentum
         arm = to_world_frame(self, inertia.arm)
@@ -221,8 +224,8 @@ class RigidBodies(NamedTuple):
 
     # checks
 
-    def validate(self, mass: Any) -> tuple["RigidBodies", Inertia]:
-        """State and inertia as arrays of one dtype that fit; ValueError or TypeError in plain words otherwise."""
+    def validate(self, mass: object) -> tuple["RigidBodies", Inertia]:
+        """State and inertia as arrays of one dtype that fit; a ValueError or TypeError in plain words otherwise."""
         if not isinstance(mass, Inertia):
             raise TypeError(
                 f"mass: got {type(mass).__name__}, expected an Inertia for rigid bodies, e.g. inertia.box(2.0, (1, 2, 3))."
@@ -233,8 +236,8 @@ class RigidBodies(NamedTuple):
             expected = (*lanes, 4 if name == "orientation" else 3)
             if array.shape != expected or not array.size:
                 raise ValueError(
-                    f"RigidBodies: got {name} of shape {array.shape}, expected {expected}: vectors of space, component "
-                    "last, quaternions (w, x, y, z), all with the lanes of the position. `bodies` fills them up."
+                    f"RigidBodies: got {name} of shape {array.shape}, expected {expected}: vectors in space, component "
+                    "last, quaternions (w, x, y, z), all with the lanes of the position. Build them with rigid.bodies."
                 )
             if array.dtype != dtype:
                 raise TypeError(f"RigidBodies: got {name} of {array.dtype}, expected {dtype} like position. Cast it.")
@@ -248,16 +251,16 @@ class RigidBodies(NamedTuple):
         return state.on_pivot(inertia), inertia
 
 
-# how bodies turn
+# rotation
 
 
 def to_world_frame(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """A vector of each body's frame, one for all or one per lane, in the world's frame: R v."""
+    """A vector of the body frame, one for all bodies or one per lane, in the world frame: R v."""
     return rotate_vector(bodies.orientation, broadcast_vector(jnp.asarray(vector, bodies.dtype), bodies.position))
 
 
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
-    """ω = R I⁻¹ Rᵀ L [rad/s], in the world's frame.
+    """ω = R I⁻¹ Rᵀ L [rad/s], in the world frame.
 
     Example:
         >>> print(rigid.angular_velocity(body, brick))
@@ -269,7 +272,7 @@ def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*la
 def angular_acceleration(
     bodies: RigidBodies, inertia: Inertia, torque: Float[Array, "*lanes 3"]
 ) -> Float[Array, "*lanes 3"]:
-    """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world's frame; the torque [N m] about the centre of mass, or the pivot.
+    """ω̇ = R I⁻¹ Rᵀ (τ - ω × L) [rad/s²], in the world frame; the torque [N m] is about the center of mass, or the pivot.
 
     Example:
         >>> print(rigid.angular_acceleration(body, brick, torque=jnp.array([0.0, 0.0, 10.0])))
@@ -280,17 +283,18 @@ def angular_acceleration(
 
 
 def rotate_freely(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
-    """The orientation after turning freely for a time dt [s], to second order, with L constant.
+    """The orientation after free rotation for a time dt [s] with L constant, to second order.
 
-    The turns about the principal axes that ½ℓᵢ²/Iᵢ alone would make (ℓ the angular momentum seen from the body), each in
-    closed form, one after the other and back: half, half, whole, half, half. Exactly reversible in time, and no energy
-    is gained or lost in the long run (R. McLachlan 1993, S. Reich 1994).
+    A symmetric splitting of the rotational energy Σ ½ℓᵢ²/Iᵢ, with ℓ the angular momentum in the body frame: each term
+    alone is a rotation about a principal axis, in closed form. They follow one another and back: half, half, whole, half,
+    half. Exactly reversible in time, and without drift of the energy (R. McLachlan 1993, S. Reich 1994).
     """
     w, *v = _principal_frame(bodies, inertia)
     spin = rotate_components(conjugate_quaternion([w, *v]), components(bodies.angular_momentum))
     inverse = components(broadcast_vector(inertia.inverse, bodies.angular_momentum))
     for i, share in ((0, 0.25), (1, 0.25), (2, 0.5), (1, 0.25), (0, 0.25)):
         j, k = (i + 1) % 3, (i + 2) % 3
+        # half the angle, by which a quaternion rotates; the vector takes the whole, by the double-angle formulas
         c, s = _cosine_and_sine(scale(dt, share * inverse[i] * spin[i]), dt)
         w, v[i], v[j], v[k] = w * c - v[i] * s, v[i] * c + w * s, v[j] * c + v[k] * s, v[k] * c - v[j] * s
         cosine, sine = c * c - s * s, 2.0 * c * s
@@ -299,7 +303,7 @@ def rotate_freely(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float
 
 
 def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
-    # kept apart: XLA on CPU would compute them again for each of the many that are made of them
+    """Cosine and sine [1] of an angle [rad], computed once: XLA on a CPU would repeat them for each of their readers."""
     return materialise(dt, lambda: (jnp.cos(angle), jnp.sin(angle)))
 
 
@@ -314,7 +318,7 @@ def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
 
 
 def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
-    """The quaternion whose turn of the principal axes is `frame`."""
+    """The orientation of bodies whose principal axes have the quaternion `frame`: the inverse of `_principal_frame`."""
     if inertia.axes is not None:
         frame = multiply_quaternions(
             frame, conjugate_quaternion(components(broadcast_vector(inertia.axes, bodies.orientation)))
@@ -323,14 +327,14 @@ def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Ar
 
 
 def _orientation_rate(bodies: RigidBodies, inertia: Inertia) -> Array:
-    """q' = ½ q (0, ω), with ω seen from the body, which is cheaper than ½ (0, ω) q with ω seen from the world."""
+    """q' = ½ q (0, ω) with ω in the body frame, which is cheaper than ½ (0, ω) q with ω in the world frame."""
     frame = _principal_frame(bodies, inertia)
     x, y, z = _apply_inverse_principal(frame, inertia, bodies.angular_momentum)
     return _body_frame(multiply_quaternions(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
 
 
 def _apply_inverse_principal(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
-    """I⁻¹ times a vector of the world, along the principal axes."""
+    """I⁻¹ Rᵀ times a vector of the world frame, in components along the principal axes."""
     parts = zip(
         components(broadcast_vector(inertia.inverse, vector)),
         rotate_components(conjugate_quaternion(frame), components(vector)),
@@ -340,6 +344,6 @@ def _apply_inverse_principal(frame: list[Array], inertia: Inertia, vector: Array
 
 
 def apply_inverse_inertia(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
-    """R I⁻¹ Rᵀ times a vector of the world: how a body turns in answer to an angular impulse."""
+    """R I⁻¹ Rᵀ times a vector of the world frame: the change of ω by an angular impulse."""
     frame = _principal_frame(bodies, inertia)
     return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia, vector)))

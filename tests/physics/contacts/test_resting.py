@@ -13,7 +13,7 @@ G = 9.8
 
 @pytest.mark.parametrize("dim", [2, 3], ids=["in the plane", "in space"])
 def test_the_force_of_a_slide_does_not_depend_on_rounding_of_no_speed(dim):
-    """A slide that begins anew has the way that was decided, whatever is left of the speed it had."""
+    """A slide that begins again has the direction that was decided, whatever is left of its speed."""
     slip = np.eye(dim)[0]
     floor = contacts.Plane(np.zeros(dim), np.eye(dim)[1], coulomb=contacts.Coulomb(0.3, 0.2))
     one = jnp.ones(())
@@ -21,12 +21,12 @@ def test_the_force_of_a_slide_does_not_depend_on_rounding_of_no_speed(dim):
     pull = -G * np.eye(dim)[1]
 
     @jax.jit
-    def felt(v):
+    def reaction_of(v):
         acceleration = lambda v: held(0.0, Particles(jnp.zeros(dim), v), jnp.asarray(pull))  # noqa: E731
         return acceleration(v), jax.jacfwd(acceleration)(v), jax.jacrev(acceleration)(v)
 
     for left in (0.0, 1e-16, -1e-16) if dim == 2 else (0.0, 1e-18, -1e-18):
-        value, *slopes = felt(jnp.full(dim, left) * np.eye(dim)[-1 if dim == 3 else 0])
+        value, *slopes = reaction_of(jnp.full(dim, left) * np.eye(dim)[-1 if dim == 3 else 0])
         np.testing.assert_allclose(
             value, -0.2 * G * slip, rtol=0, atol=1e-15 if dim == 2 else 0.01
         )  # in space a hair is mixed in
@@ -68,7 +68,7 @@ def test_derivatives_of_a_slide_that_turns_back_stops_or_goes_on(method):
 @pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
-    reason="'First answers in a second': where a slide in space passes near zero speed its way turns within a step",
+    reason="'First answers in a second': where a slide in space passes near zero speed its direction turns within a step",
 )
 def test_a_slide_in_space_that_passes_near_zero_speed_keeps_its_order():
     """Up a slope and a little aside: at the top the way turns through half a circle while the block hardly moves."""

@@ -39,10 +39,10 @@ def test_an_edge_that_meets_a_ball_in_its_middle_shares_the_push():
     masses = (1.0, 3.0)
     before = ends([-1.0, 0.9], [0.5, 0.9], [0.0, -2.0], [0.0, -2.0])
     after = contacts.respond_segment(ball, 0.0, *before, masses=masses)
-    # the point that touched is on the ball now; the edge has turned a little about it
+    # the contact point is on the ball now; the edge has rotated a little about it
     share = contacts.nearest_on_segment(ball, 0.0, *(state.position for state in before)).share
-    touched = (1 - share) * after[0].position + share * after[1].position
-    assert float(ball.signed_distance(0.0, touched)) == pytest.approx(0.0, abs=1e-12)
+    contact_point = (1 - share) * after[0].position + share * after[1].position
+    assert float(ball.signed_distance(0.0, contact_point)) == pytest.approx(0.0, abs=1e-12)
     energy = lambda pair: sum(m * float(jnp.sum(s.velocity**2)) for m, s in zip(masses, pair, strict=True))  # noqa: E731
     assert energy(after) == pytest.approx(energy(before), rel=1e-12)
     sideways = sum(m * float(s.velocity[0]) for m, s in zip(masses, after, strict=True))

@@ -98,7 +98,7 @@ def test_ten_thousand_balls_stay_in_their_room_and_keep_their_energy(precision):
     assert float(energy) == pytest.approx(1.0, abs=1000 * precision.eps)
 
 
-def test_a_corner_answers_with_all_its_walls():
+def test_a_corner_responds_with_all_its_walls():
     x, v = after(contacts.Room((0, 0, 0), (1, 1, 1)), [-0.1, 1.2, 0.5], [-1.0, 2.0, 3.0])
     np.testing.assert_allclose(x, [0, 1, 0.5], atol=1e-15)
     np.testing.assert_allclose(v, [1, -2, 3])

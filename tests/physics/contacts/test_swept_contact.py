@@ -1,4 +1,4 @@
-"""What is fast, thin, curved or closing in: bodies pass nothing, roll over curved ground, and are never lost unsaid."""
+"""Fast bodies, thin and curved surfaces, closing walls: nothing passes, balls roll, and failures are reported."""
 
 from functools import cache
 
@@ -15,28 +15,28 @@ BALL, HULL = inertia.sphere(1.0, r), rigid.ContactPoints.sphere(r)
 
 
 class Bowl(contacts.Surface):
-    """The inside of a sphere of radius R about the origin, which says no more than its signed distance."""
+    """The inside of a sphere of radius R about the origin, given by its signed distance alone."""
 
     def signed_distance(self, t, position):
         return R - jnp.sqrt(jnp.sum(position * position, axis=-1))
 
 
 class Globe(contacts.Surface):
-    """The outside of it, which says no more than that."""
+    """The outside of it, given by that alone."""
 
     def signed_distance(self, t, position):
         return jnp.sqrt(jnp.sum(position * position, axis=-1)) - R
 
 
 class Pillar(contacts.Surface):
-    """A post along z, which says no more than its signed distance."""
+    """A post along z, given by its signed distance alone."""
 
     def signed_distance(self, t, position):
         return jnp.hypot(position[..., 0], position[..., 1]) - 0.1
 
 
 class Sheet(contacts.Surface):
-    """A plate of a millimetre with two sides, which says no more than that."""
+    """A plate of a millimetre with two sides, given by that alone."""
 
     def signed_distance(self, t, position):
         return jnp.abs(position[..., 0] + 0.3 * position[..., 1] - 1) / np.sqrt(1.09) - 5e-4
@@ -52,13 +52,13 @@ def test_balls_meet_a_post_and_a_thin_plate_as_geometry_says_however_fast():
     speed = np.tile((100.0, 1000.0), 20)
     start = np.stack([np.full(40, -3.2), aside, 0 * aside], axis=-1)
     body, hull = inertia.sphere(0.01, small), rigid.ContactPoints.sphere(small)
-    touches = (
+    touching = (
         rigid.SurfaceContact(hull, contacts.Sphere((0.0, 0.0, 0.0), post)),
         rigid.SurfaceContact(hull, contacts.Slab((plate, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3)),
     )
     bodies = rigid.bodies(body, jnp.asarray(start), velocity=jnp.asarray(speed[:, None] * np.eye(3)[0]))
     dt = jnp.asarray(path / 3 / speed)  # five radii of the post a step
-    run = simulate(Scene(bodies, body, (), touches), methods.rk4, dt=dt, steps=3, save_every=3)
+    run = simulate(Scene(bodies, body, (), touching), methods.rk4, dt=dt, steps=3, save_every=3)
 
     x, v, left = start, np.tile(np.eye(3)[0], (40, 1)), np.full(40, path)
     hits = aside < post + small
@@ -98,9 +98,9 @@ def test_no_corner_of_dice_and_rods_passes_a_thin_plate():
 def test_a_body_that_straddles_a_plate_is_refused():
     box = inertia.box(1.0, (0.4, 0.4, 0.4))
     plate = contacts.Slab((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), thickness=1e-3)
-    touch = rigid.SurfaceContact(rigid.ContactPoints.box((0.4, 0.4, 0.4)), plate)
+    contact = rigid.SurfaceContact(rigid.ContactPoints.box((0.4, 0.4, 0.4)), plate)
     with pytest.raises(ValueError, match=r"on the wrong side, 0\.101 m deep"):
-        Scene(rigid.bodies(box, (-0.1, 0.0, 0.0)), box, (), (touch,))
+        Scene(rigid.bodies(box, (-0.1, 0.0, 0.0)), box, (), (contact,))
 
 
 @pytest.mark.slow
@@ -121,8 +121,8 @@ def test_balls_keep_to_mirror_images_in_a_room_its_edges_and_corners_too():
 
 
 @pytest.mark.slow
-def test_coupled_bodies_are_held_back_by_a_plate_and_lost_in_a_ball_that_they_pass():
-    """Their impacts are answered at the end of a step: a scene that was through a ball by then says so, and only that one."""
+def test_coupled_bodies_are_stopped_by_a_plate_and_non_finite_after_passing_a_ball():
+    """Their impacts are resolved at the end of a step: a scene that has passed through a ball by then reports it."""
     places = jnp.array([[[-1.0, 0.0, 0.0], [-1.0, 5.0, 0.0]], [[-1.0, 2.0, 0.0], [-1.0, 5.0, 0.0]]])
     bodies = rigid.bodies(BALL, places, velocity=jnp.array([[100.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     spring = rigid.Joints([(0, 1)], [[[0.0, 0.0, 0.0], [0.0, -5.0, 0.0]]], stiffness=1e-3)
@@ -147,16 +147,16 @@ def darts(n):
     return Particles(jnp.asarray(x), jnp.asarray(v))
 
 
-def test_a_shape_of_ones_own_is_met_however_thin_it_is():
+def test_a_users_shape_is_met_however_thin_it_is():
     """Straight on for a second: from the signed distance alone a post is met as a circle is, a plate as a line."""
     start = darts(200)
     end = Particles(start.position + start.velocity, start.velocity)
-    nowhere = jnp.full(200, jnp.nan), jnp.zeros(200)
+    missing = jnp.full(200, jnp.nan), jnp.zeros(200)
 
     @jax.jit
     def look(start, end):
         shapes = Pillar(), Sheet()
-        return [(s.deepest(0.0, 1.0, start, end, nowhere), s.may_dip(0.0, 1.0, start, end)) for s in shapes]
+        return [(s.deepest(0.0, 1.0, start, end, missing), s.may_dip(0.0, 1.0, start, end)) for s in shapes]
 
     post, plate = look(start, end)
     y = np.asarray(start.position[:, 1])
@@ -171,7 +171,7 @@ def test_a_shape_of_ones_own_is_met_however_thin_it_is():
 
 
 @pytest.mark.slow
-def test_particles_meet_shapes_of_ones_own_as_ours():
+def test_particles_meet_a_users_shapes_like_those_of_the_library():
     start = darts(64)
     start = start._replace(velocity=40 * start.velocity)
     ours = contacts.Sphere((0.0, 0.0), 0.1), contacts.Slab((1.0, 0.0), (1.0, 0.3), thickness=1e-3)
@@ -208,7 +208,7 @@ def test_a_ball_rolls_in_a_bowl_with_second_order():
 
 
 @pytest.mark.slow
-def test_a_bowl_of_ones_own_is_rolled_in_alike():
+def test_a_ball_rolls_in_a_users_bowl_with_second_order():
     rough = contacts.Coulomb(50.0, 50.0)
     fine, coarse = bowl_errors(Bowl(restitution=0.0, coulomb=rough))
     assert fine < 1e-5
@@ -231,7 +231,7 @@ def test_a_ball_rolls_off_a_globe_where_it_must():
 
 
 @pytest.mark.slow
-def test_a_particle_leaves_a_crest_of_ones_own_where_it_must():
+def test_a_particle_leaves_a_users_globe_where_it_must():
     """From a signed distance alone: it slides from the top with v, and leaves at cos θ = 2/3 + v²/(3 g R)."""
     v = 0.6
     slide = Particles(jnp.array([0.0, R]), jnp.array([v, 0.0]))
@@ -273,7 +273,7 @@ def between_closing_walls():
     return simulate(Scene(balls, contacts=walls), methods.rk4, dt=STEP, steps=19)
 
 
-def test_a_closing_wall_never_passes_a_waiting_ball_unsaid():
+def test_a_closing_wall_that_passes_a_waiting_ball_is_reported():
     run = between_closing_walls()
     x, t = np.asarray(run.position[:, 0, 0]), np.asarray(run.time)
     fine = np.isfinite(x)
@@ -286,13 +286,13 @@ def test_a_closing_wall_never_passes_a_waiting_ball_unsaid():
 
 
 @pytest.mark.slow
-def test_what_is_lost_under_a_surface_is_explained():
-    told = stability.explain(between_closing_walls(), lane=0)
-    assert told.cause == "contact"
-    assert "waited for the next" in str(told)
+def test_an_overrun_lane_is_explained():
+    found = stability.explain(between_closing_walls(), lane=0)
+    assert found.cause == "contact"
+    assert "waited for the next" in str(found)
 
 
-@pytest.mark.xfail(strict=True, reason="'First answers in a second': more than eight touches in a step")
+@pytest.mark.xfail(strict=True, reason="'First answers in a second': more than eight impacts in a step")
 def test_a_ball_between_closing_walls_is_where_its_bounces_take_it():
     run = between_closing_walls()
     x, v, t, end = 0.5, 1.0, 0.0, 18 * STEP

@@ -75,7 +75,7 @@ def test_two_bounces_within_one_step():
     assert float(end.velocity[1]) == pytest.approx(speed - G * t, abs=1e-12)
 
 
-def test_at_the_bound_of_touches_a_lane_waits_and_keeps_its_energy():
+def test_at_the_bound_of_impacts_a_lane_waits_and_keeps_its_energy():
     walls = (contacts.Plane((0.0, 0.0), (1.0, 0.0)), contacts.Plane((1e-3, 0.0), (-1.0, 0.0)))
     scene = Scene(Particles(jnp.asarray([5e-4, 0.0]), jnp.asarray([10.0, 0.5])), contacts=walls)
     flight = simulate(scene, methods.verlet, dt=0.1, steps=50)
@@ -394,7 +394,7 @@ def test_a_bad_lane_harms_no_other():
     np.testing.assert_allclose(flight.position[:, 0], alone.position, rtol=1e-12)
 
 
-def test_coupled_lanes_cannot_have_their_own_moments():
+def test_coupled_lanes_cannot_have_their_own_impact_times():
     pair = Particles(jnp.asarray([[0.0, 1.0], [0.5, 1.0]]), jnp.zeros((2, 2)))
     floor = contacts.Plane(**FLOOR, response=contacts.impact)
     with pytest.raises(ValueError, match="couple"):

@@ -130,7 +130,7 @@ def test_sizes_and_masses_are_swept():
         (lambda: inertia.of_tensor(1.0, [[1, 2, 0], [0, 1, 0], [0, 0, 1.0]]), "symmetric"),
         (lambda: inertia.of_tensor(1.0, np.ones((2, 2))), "\\(3, 3\\)"),
         (lambda: inertia.mesh(CUBE, CUBE_FACES[1:], mass=1.0), "closed"),
-        (lambda: inertia.mesh(CUBE, [*CUBE_FACES[1:], CUBE_FACES[0][::-1]], mass=1.0), "turns the same way"),
+        (lambda: inertia.mesh(CUBE, [*CUBE_FACES[1:], CUBE_FACES[0][::-1]], mass=1.0), "with the same orientation"),
         (lambda: inertia.mesh(CUBE * [1, 1, 0], CUBE_FACES, mass=1.0), "volume"),
         (lambda: inertia.mesh(CUBE, CUBE_FACES), "either mass= "),
         (lambda: inertia.points([1.0, 1.0], [[0, 0, 0.0]]), "positions"),

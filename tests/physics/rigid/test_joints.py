@@ -26,12 +26,12 @@ def test_a_free_chain_keeps_momentum_angular_momentum_and_energy():
     assert scene.couples
     film = simulate(scene, methods.rk4, dt=1e-4, steps=4000, save_every=200)
     for quantity, off in ((energy.MOMENTUM, 1e-13), (energy.ANGULAR_MOMENTUM, 1e-8), (energy.ENERGY, 1e-5)):
-        told = np.asarray(jax.vmap(lambda t, s, q=quantity: q.value(scene, t, s))(film.time, film.state))
-        assert np.abs(told - told[:1]).max() < off * float(quantity.size(scene, 0.0, scene.state)), quantity.name
+        values = np.asarray(jax.vmap(lambda t, s, q=quantity: q.value(scene, t, s))(film.time, film.state))
+        assert np.abs(values - values[:1]).max() < off * float(quantity.size(scene, 0.0, scene.state)), quantity.name
     assert jax.vmap(joints.error)(film.state).max() < 0.02
 
 
-def test_a_hanging_chain_parts_by_its_weight_over_the_stiffness():
+def test_a_hanging_chain_separates_by_its_weight_over_the_stiffness():
     held = jnp.asarray([True, False, False, False])
     scene, joints = chain(damping=300.0, acting=(forces.Gravity(),), pinned=held)
     end = simulate(scene, methods.rk4, dt=1e-3, steps=2000, save_every=2000).final_scene.state

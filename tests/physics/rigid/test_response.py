@@ -1,4 +1,4 @@
-"""Bodies that touch: impacts add no energy, what rests does not move, friction holds and slides, derivatives, bad input."""
+"""Bodies in contact: impacts add no energy, resting bodies do not move, friction sticks and slips, derivatives, bad input."""
 
 import math
 
@@ -26,7 +26,7 @@ def dropped(surface, height=0.4, **start):
     return Scene(state, BOX, (forces.Gravity(),), (rigid.SurfaceContact(CORNERS, surface),))
 
 
-def told(scene, film):
+def compute_energy(scene, film):
     return np.asarray(jax.vmap(lambda t, s: energy.total(scene, t, s))(film.time, film.state))
 
 
@@ -69,13 +69,13 @@ def test_a_thousand_random_drops_never_gain_energy():
     def gain(lanes, dt, each):
         pick = lambda tree: jax.tree.map(lambda leaf: leaf[lanes], tree)  # noqa: E731
         ground = floor(jnp.asarray(bounce[lanes]), jnp.asarray(rough[lanes]))
-        touch = rigid.SurfaceContact(rigid.ContactPoints.box(size[lanes]), ground)
-        scene = Scene(pick(start), pick(body), (forces.Gravity(),), (touch,))
+        contact = rigid.SurfaceContact(rigid.ContactPoints.box(size[lanes]), ground)
+        scene = Scene(pick(start), pick(body), (forces.Gravity(),), (contact,))
         film = simulate(scene, methods.rk4, dt=dt, steps=80 * each, save_every=each)
         assert film.ok.all()
-        signed_distance = jax.vmap(lambda state: touch.clearance(0.0, state))(film.state)
+        signed_distance = jax.vmap(lambda state: contact.clearance(0.0, state))(film.state)
         assert signed_distance.min() > -1e-5
-        e = told(scene, film)
+        e = compute_energy(scene, film)
         assert (e[-1] / e[0]).mean() < 0.8
         return (e / e[0]).max(axis=0) - 1
 
@@ -91,7 +91,7 @@ def test_a_smooth_box_keeps_its_energy_over_a_hundred_impacts():
     film = simulate(scene, methods.rk4, dt=1e-3, steps=16_000)
     impacts = np.sum(np.diff(film.state.momentum[:, 1]) > 0)  # gravity alone only takes from it
     assert impacts >= 100
-    e = told(scene, film)
+    e = compute_energy(scene, film)
     assert np.abs(e / e[0] - 1).max() < 1e-6
 
 
@@ -164,18 +164,25 @@ def test_gradients_through_an_impact_agree_with_differences(derivative):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: rigid.ContactPoints(jnp.zeros(3)), "A ball is Hull.sphere"),
+        (lambda: rigid.ContactPoints(jnp.zeros(3)), "A ball is ContactPoints.sphere"),
         (lambda: rigid.ContactPoints.sphere(0.0), "numbers > 0"),
         (lambda: rigid.ContactPoints.capsule(0.1, 1.0, axis=3), "expected 0, 1 or 2"),
-        (lambda: rigid.SurfaceContact(floor(), CORNERS), "expected a Hull"),
+        (lambda: rigid.SurfaceContact(floor(), CORNERS), "expected a ContactPoints"),
         (lambda: rigid.SurfaceContact(CORNERS, 0.0), "expected a Surface"),
         (lambda: rigid.SurfaceContact(CORNERS, contacts.Plane((0, 0, 0), UP, friction=0.1)), "coulomb="),
         (lambda: dropped(floor(), height=0.1), "on the wrong side"),
-        (lambda: Scene(Particles(jnp.zeros(3), jnp.zeros(3)), contacts=(rigid.SurfaceContact(CORNERS, floor()),)), "expected RigidBodies"),
+        (
+            lambda: Scene(
+                Particles(jnp.zeros(3), jnp.zeros(3)), contacts=(rigid.SurfaceContact(CORNERS, floor()),)
+            ),
+            "expected RigidBodies",
+        ),
         (lambda: Scene(dropped(floor()).state, BOX, contacts=(floor(),)), "rigid.SurfaceContact"),
         (
             lambda: Scene(
-                RigidBodies(*dropped(floor()).state), BOX, contacts=(rigid.SurfaceContact(rigid.ContactPoints(jnp.zeros((4, 2, 3))), floor()),)
+                RigidBodies(*dropped(floor()).state),
+                BOX,
+                contacts=(rigid.SurfaceContact(rigid.ContactPoints(jnp.zeros((4, 2, 3))), floor()),),
             ),
             r"expected a vector of shape \(n, 3\) for all lanes",
         ),

@@ -50,7 +50,7 @@ def truth(name):
 
 
 def errors(name, method, counts):
-    """The error of the orientation after two seconds, for runs with so many steps."""
+    """The error of the orientation after two seconds, for runs with n steps."""
     scene, true = SCENES[name], truth(name)
     ends = [
         sample_states(scene, as_module(method), jnp.asarray(2.0 / n), jnp.asarray(n), 1).orientation[-1] for n in counts
@@ -158,8 +158,8 @@ def test_a_pivot_never_moves_and_the_body_falls_as_newton_says():
 def test_a_pivot_keeps_the_energy_of_a_swing():
     swing = Scene(HUNG.state, HUNG.mass, (forces.Gravity(),))
     film = simulate(swing, methods.rk4, dt=1e-3, steps=3000, save_every=100)
-    told = jax.vmap(lambda t, s: energy.total(swing, t, s))(film.time, film.state)
-    np.testing.assert_allclose(told, told[0], rtol=0, atol=1e-9 * float(energy.kinetic(swing, 0.0, swing.state)))
+    totals = jax.vmap(lambda t, s: energy.total(swing, t, s))(film.time, film.state)
+    np.testing.assert_allclose(totals, totals[0], rtol=0, atol=1e-9 * float(energy.kinetic(swing, 0.0, swing.state)))
 
 
 # both frames
@@ -179,14 +179,14 @@ def test_the_body_feels_eulers_equations():
         bend = bend + jnp.stack([0 * w[0], 0 * w[0], w[0] * i[1] * w[1] - w[1] * i[0] * w[0]])
         return (jnp.asarray(torque) - bend) / i
 
-    told = diffrax.diffeqsolve(
+    truth_by_diffrax = diffrax.diffeqsolve(
         diffrax.ODETerm(euler), diffrax.Dopri8(), 0.0, 2.0, None, jnp.asarray(omega),
         stepsize_controller=diffrax.PIDController(1e-12, 1e-12),
     ).ys[-1]  # fmt: skip
     end = reference(Scene(state, BRICK, (rigid.Torque(torque, "body"),)), [2.0], rtol=1e-12, atol=1e-12).state
     last = RigidBodies(*(jnp.asarray(a[-1]) for a in end))
     found = rotate_vector_back(last.orientation, rigid.angular_velocity(last, BRICK))
-    np.testing.assert_allclose(found, told, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found, truth_by_diffrax, rtol=0, atol=1e-9)
 
 
 def test_points_of_a_body_move_as_their_derivatives_say():
@@ -200,14 +200,14 @@ def test_points_of_a_body_move_as_their_derivatives_say():
     where = lambda state: rigid.point(state, place)  # noqa: E731
     fast = lambda state: rigid.point_velocity(state, ASKEW, place)  # noqa: E731
     np.testing.assert_allclose(fast(scene.state), jax.jvp(where, (scene.state,), (change,))[1], rtol=0, atol=1e-14)
-    told = rigid.point_acceleration(scene, 0.0, place)
-    np.testing.assert_allclose(told, jax.jvp(fast, (scene.state,), (change,))[1], rtol=0, atol=1e-14)
+    acceleration = rigid.point_acceleration(scene, 0.0, place)
+    np.testing.assert_allclose(acceleration, jax.jvp(fast, (scene.state,), (change,))[1], rtol=0, atol=1e-14)
 
 
 # loads
 
 
-def test_loads_are_told_with_force_and_torque_and_each_by_itself():
+def test_loads_are_reported_with_force_and_torque_and_each_separately():
     state = rigid.bodies(BRICK, position=(1, 2, 3), angular_velocity=OMEGA)
     off = rigid.AtPoint((0, 0, 1.0), forces.Constant(jnp.asarray([2.0, 0, 0])))
     scene = Scene(state, BRICK, (forces.Gravity(10.0), off, rigid.RotationalDrag(0.5), rigid.Torque((1.0, 0, 0))))
@@ -249,8 +249,8 @@ def test_a_spring_between_points_of_two_bodies_keeps_momentum_angular_momentum_a
     assert pair.couples
     film = simulate(pair, methods.rk4, dt=1.25e-4, steps=16_000, save_every=800)
     for quantity in (energy.ENERGY, energy.MOMENTUM, energy.ANGULAR_MOMENTUM):
-        told = np.asarray(jax.vmap(lambda t, s, q=quantity: q.value(pair, t, s))(film.time, film.state))
-        assert np.abs(told - told[0]).max() < 1e-9 * float(quantity.size(pair, 0.0, pair.state)), quantity.name
+        values = np.asarray(jax.vmap(lambda t, s, q=quantity: q.value(pair, t, s))(film.time, film.state))
+        assert np.abs(values - values[0]).max() < 1e-9 * float(quantity.size(pair, 0.0, pair.state)), quantity.name
     assert np.ptp(jax.vmap(lambda t, s: energy.kinetic(pair, t, s))(film.time, film.state)) > 1.0
 
 
@@ -261,7 +261,7 @@ def test_rotational_drag_stops_a_ball_as_it_should():
     np.testing.assert_allclose(end.angular_momentum[2], 4 * 0.072 * math.exp(-0.1 / 0.072), rtol=1e-6)
 
 
-def test_a_plain_function_is_a_load_when_it_is_told_so():
+def test_a_plain_function_is_a_load_when_it_is_wrapped():
     @rigid.on_bodies
     def magnet(t, bodies, inertia):
         return rigid.Wrench(
@@ -330,15 +330,15 @@ def test_a_line_turns_about_what_it_can():
     np.testing.assert_allclose(end.orientation, [math.cos(0.5), math.sin(0.5), 0, 0], atol=1e-9)
 
 
-def test_held_bodies_stay_and_a_sick_lane_harms_no_other():
+def test_held_bodies_stay_and_a_bad_lane_harms_no_other():
     x = jnp.asarray([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     scene = Scene(
         rigid.bodies(BRICK, x, angular_velocity=OMEGA), BRICK, (forces.Gravity(),), pinned=jnp.asarray([True, False, False])
     )  # fmt: skip
-    sick = scene.replace(
+    bad = scene.replace(
         state=scene.state._replace(momentum=scene.state.momentum * jnp.asarray([[1.0], [1.0], [jnp.nan]]))
     )
-    film = simulate(sick, methods.rk4, dt=0.01, steps=10)
+    film = simulate(bad, methods.rk4, dt=0.01, steps=10)
     np.testing.assert_array_equal(film.ok, [True, True, False])
     np.testing.assert_array_equal(film.state.orientation[-1, 0], scene.state.orientation[0])
     np.testing.assert_array_equal(film.position[-1, 0], x[0])
@@ -359,7 +359,7 @@ def test_a_run_is_saved_loaded_and_resumed(tmp_path):
 # bad input
 
 
-def begun(**changes):
+def initial(**changes):
     state = dict(position=jnp.zeros(3), orientation=jnp.asarray([1.0, 0, 0, 0]), momentum=jnp.zeros(3))
     return RigidBodies(**(state | dict(angular_momentum=jnp.zeros(3)) | changes))
 
@@ -368,21 +368,21 @@ def begun(**changes):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: Scene(begun()), "expected an Inertia"),
-        (lambda: Scene(begun(), 2.0), "expected an Inertia"),
-        (lambda: Scene(begun(orientation=jnp.zeros(4)), BRICK), "not zero"),
-        (lambda: Scene(begun(position=jnp.zeros(2)), BRICK), "vectors of space"),
-        (lambda: Scene(begun(orientation=jnp.ones((2, 4))), BRICK), "expected \\(4,\\)"),
-        (lambda: Scene(begun(momentum=jnp.full(3, jnp.nan)), BRICK), "finite"),
-        (lambda: Scene(begun(), inertia.box(jnp.ones(3), (1, 1, 1))), "Inertia: got mass"),
-        (lambda: Scene(begun(), BRICK, contacts=(contacts.Plane((0, 0, 0), (0, 1, 0)),)), "expected Particles"),
-        (lambda: Scene(begun(), BRICK, pinned=Pins(jnp.asarray(True), lambda t: jnp.zeros(3))), "held by a mask"),
+        (lambda: Scene(initial()), "expected an Inertia"),
+        (lambda: Scene(initial(), 2.0), "expected an Inertia"),
+        (lambda: Scene(initial(orientation=jnp.zeros(4)), BRICK), "not zero"),
+        (lambda: Scene(initial(position=jnp.zeros(2)), BRICK), "vectors in space"),
+        (lambda: Scene(initial(orientation=jnp.ones((2, 4))), BRICK), "expected \\(4,\\)"),
+        (lambda: Scene(initial(momentum=jnp.full(3, jnp.nan)), BRICK), "finite"),
+        (lambda: Scene(initial(), inertia.box(jnp.ones(3), (1, 1, 1))), "Inertia: got mass"),
+        (lambda: Scene(initial(), BRICK, contacts=(contacts.Plane((0, 0, 0), (0, 1, 0)),)), "expected Particles"),
+        (lambda: Scene(initial(), BRICK, pinned=Pins(jnp.asarray(True), lambda t: jnp.zeros(3))), "held by a mask"),
         (lambda: loads(Scene(Particles(jnp.zeros(3), jnp.zeros(3)), 1.0, (rigid.Torque((1, 0, 0.0)),)), 0.0), "RigidBodies"),
         (lambda: rigid.Torque((1, 0, 0.0), frame="moon"), "'world' or 'body'"),
         (lambda: rigid.AtPoint((0, 0, 0), rigid.Torque((1, 0, 0.0))), "force on particles"),
         (lambda: rigid.AtPoint((0, 0, 0), springs.Springs([[0, 1]], 1.0, 1.0, breaks_at=0.1)), "forgets"),
         (lambda: rigid.bodies(BRICK, position=(0, 0)), "expected \\(\\*lanes, 3\\)"),
-        (lambda: loads(Scene(begun(), BRICK, (lambda t, s, m: jnp.zeros(2),)), 0.0), "expected \\(3,\\)"),
+        (lambda: loads(Scene(initial(), BRICK, (lambda t, s, m: jnp.zeros(2),)), 0.0), "expected \\(3,\\)"),
     ],
 )  # fmt: skip
 def test_bad_input_is_refused_in_plain_words(build, words):
@@ -391,5 +391,5 @@ def test_bad_input_is_refused_in_plain_words(build, words):
 
 
 def test_a_quaternion_of_any_length_is_brought_to_one():
-    scene = Scene(begun(orientation=jnp.asarray([2.0, 0, 0, 0])), BRICK)
+    scene = Scene(initial(orientation=jnp.asarray([2.0, 0, 0, 0])), BRICK)
     np.testing.assert_array_equal(scene.state.orientation, [1, 0, 0, 0])

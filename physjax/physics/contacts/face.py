@@ -1,0 +1,74 @@
+"""What the search for impacts and the forces of resting contact need of a surface, as protocols.
+
+A `Surface` for particles has all of it. A hull of contact points on a surface (`rigid.SurfaceContact`) has the geometry
+alone: it is searched for impacts like a surface that lies a radius higher, and has a response of its own.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from physjax.particles import Particles
+from physjax.physics.contacts.restitution import Material
+
+
+@runtime_checkable
+class Located(Protocol):
+    """A record of moving things, particles or rigid bodies, as far as contacts with surfaces that move over them go."""
+
+    @property
+    def position(self) -> Array:
+        """Where each lane is [m]."""
+        ...
+
+
+LowestPoint = tuple[Array, Array]
+"""Where a path comes lowest, as a share of the step, and the signed distance [m] there."""
+
+
+@runtime_checkable
+class Face(Protocol):
+    """The geometry of a surface: signed distance, normal, its own motion, and where a path dips below it."""
+
+    def signed_distance(self, t: ArrayLike, position: Array) -> Array:
+        """Signed distance [m], > 0 on the legal side."""
+        ...
+
+    def normal_at(self, t: ArrayLike, position: Array) -> Array:
+        """Unit vector towards the legal side."""
+        ...
+
+    def relative(self, velocity: Array) -> Array:
+        """Velocities relative to the surface [m/s]."""
+        ...
+
+    def clearance(self, t: ArrayLike, state: Any) -> Array:
+        """How far each lane is from the surface [m]."""
+        ...
+
+    def deepest(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles, dip: LowestPoint) -> LowestPoint:
+        """Where the path through the ends of a step comes lowest, given where a cubic in time does."""
+        ...
+
+
+@runtime_checkable
+class ContactFace(Face, Material, Protocol):
+    """A surface that particles can rest on: its geometry with its curvature, restitution and friction."""
+
+    velocity: Float[Array, "..."] | None
+    touching_since: Float[Array, "..."] | None
+
+    def facing(self, t: ArrayLike, position: Array) -> "ContactFace":
+        """The surface as a lane at this position meets it."""
+        ...
+
+    def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
+        """What the curvature adds to the second time derivative of the signed distance [m/s²]."""
+        ...
+
+    def may_meet(
+        self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
+    ) -> Bool[Array, "*lanes"]:
+        """Whether a lane may meet the surface within a step."""
+        ...
