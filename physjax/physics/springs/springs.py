@@ -1,6 +1,6 @@
 """Damped springs between pairs of nodes, of which ropes, cloth, jelly and bridges are made."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -151,13 +151,14 @@ class Springs(Force):
         return self.topology.neighbours.sum_at_both_ends(energies)
 
     @property
-    def advance(self) -> Any:
-        """`advance(t, dt, state) -> (springs, state)` parts the springs that are overstretched; only if they can break."""
-        if self.limit is None:
-            raise AttributeError("springs without breaks_at remember nothing")
-        return self._break_overstretched
+    def remembers(self) -> bool:
+        """Whether springs can break."""
+        return self.limit is not None
 
-    def _break_overstretched(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
+    def advance(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
+        """The springs without those that are stretched beyond `breaks_at`; they stay broken."""
+        if self.limit is None:
+            return self, state
         self._demand_nodes(state)
         held = []
         for slot, d in enumerate(self.topology.parts(state.position)[0]):
