@@ -122,7 +122,8 @@ def respond_at_float_time(response: Callable, motion: Callable, scene: Any, t: A
 
 def is_library_part(part: Any) -> bool:
     """Whether a function or a module is the library's own, which may get a moment instead of a float."""
-    return getattr(getattr(part, "function", part), "__module__", "").startswith("physjax.")
+    module = getattr(getattr(part, "function", part), "__module__", None)  # None: made by exec
+    return (module or "").startswith("physjax.")
 
 
 def force_rounding(number: Float[Array, "..."]) -> Float[Array, "..."]:

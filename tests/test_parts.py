@@ -58,12 +58,12 @@ def test_a_force_that_says_nothing_has_no_ability():
 
 
 def test_abilities_are_seen_where_they_are_defined():
-    sheet = lattices.rope(1.0, 3, mass=0.3, stiffness=10.0)
-    brittle = lattices.rope(1.0, 3, mass=0.3, stiffness=10.0, breaks_at=0.1)
+    sheet = lattices.rope((0.0, 0.0), (1.0, 0.0), 3, mass=0.3, stiffness=10.0)
+    brittle = lattices.rope((0.0, 0.0), (1.0, 0.0), 3, mass=0.3, stiffness=10.0, breaks_at=0.1)
     assert forces.Gravity().has_potential
     assert forces.Gravity().is_field
     assert forces.Gravity().up_axis == 1
-    assert forces.Kick((1.0, 0.0), at=0.5).jumps
+    assert forces.Kick((1.0, 0.0), at=0.5, duration=0.1).jumps
     assert sheet.springs.has_linearisation
     assert (sheet.springs.remembers, brittle.springs.remembers) == (False, True)
     assert not forces.QuadraticDrag(area=1.0, coefficient=1.0).has_potential

@@ -10,6 +10,8 @@ from physjax.particles import Particles
 from physjax.physics.contacts.surface import Surface
 from physjax.vectors import scale
 
+__all__ = ["Corners", "Nearest", "nearest_on_segment", "respond_segment", "touching_corners"]
+
 
 class Nearest(NamedTuple):
     """The point of a segment nearest to a surface: its share of the way from the first end, place and distance [m].

@@ -20,6 +20,9 @@ from physjax.physics.contacts.face import LowestPoint
 from physjax.physics.contacts.surface import Surface
 from physjax.vectors import broadcast_vector, dot, norm, scale, unit
 
+__all__ = ["Plane", "Room", "Slab", "Sphere"]
+
+
 R = TypeVar("R", bound="Room")
 
 SMALLEST_LENGTH_SQUARED = 1e-30

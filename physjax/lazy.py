@@ -1,0 +1,20 @@
+"""Folders whose modules are loaded when they are first named, so that importing one does not import its neighbours."""
+
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from pkgutil import iter_modules
+from types import ModuleType
+
+
+def serve_submodules(
+    package: str, path: Iterable[str]
+) -> tuple[list[str], Callable[[str], ModuleType], Callable[[], list[str]]]:
+    """`__all__`, `__getattr__` and `__dir__` of a package of modules, for its `__init__`."""
+    names = sorted(module.name for module in iter_modules(path))
+
+    def load(name: str) -> ModuleType:
+        if name in names:
+            return import_module(f"{package}.{name}")
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+
+    return names, load, lambda: names
