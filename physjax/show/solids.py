@@ -29,12 +29,14 @@ MIN_EDGE_SHARE = 0.02
 MIN_AREA_SHARE = 1e-12
 """A triangle with an area below this share of the square of the shape's size has collapsed to a line, as at a pole."""
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""The corners of a cube of edge 1 about the origin."""
 _CUBE_FACES = np.array(
     [
         *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
         *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
     ]
 )
+"""The twelve triangles of that cube, counterclockwise seen from outside."""
 
 
 class Shape(NamedTuple):

@@ -18,6 +18,7 @@ from physjax.physics.rigid.spatial import RigidBodies, to_world_frame
 from physjax.vectors import scale
 
 _CORNERS = tuple(product((-1.0, 1.0), repeat=3))
+"""The corners of a cube, in half its edges from its centre."""
 
 
 class ContactPoints(eqx.Module):
