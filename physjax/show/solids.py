@@ -5,9 +5,8 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
 
-from physjax.checks import as_real_quantity
+from physjax.checks import NestedArrayLike, as_real_quantity
 from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import RigidBodies
@@ -45,7 +44,7 @@ class Shape(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
 
-    def at(self, place: ArrayLike) -> "Shape":
+    def at(self, place: NestedArrayLike) -> "Shape":
         """The shape moved by a vector [m] in the frame of the body."""
         return self._replace(vertices=self.vertices + np.asarray(place, float))
 
@@ -56,7 +55,7 @@ class Shape(NamedTuple):
         return Shape(np.concatenate(vertices), np.concatenate([f + s for f, s in zip(faces, starts, strict=True)]))
 
 
-def box(size: ArrayLike) -> Shape:
+def box(size: NestedArrayLike) -> Shape:
     """A box with edges along the axes [m], `(3,)`."""
     return Shape(_CUBE * np.asarray(as_real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
 
