@@ -1,7 +1,7 @@
-"""Plain words for bad input: what was given, what was expected, what to do.
+"""Checks of input, with errors in plain words: what was given, what was expected, what to do.
 
-Values are looked at only where they are concrete. Inside `jit`, `vmap` and `grad` shapes and dtypes are still checked;
-a bad value there becomes a status of the run (`Trajectory.ok`), never an exception.
+Values are checked only where they are concrete. Inside `jit`, `vmap` and `grad` shapes and dtypes are still checked; a
+bad value there shows in the status of the run (`Trajectory.ok`) and never raises an exception.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,26 +14,27 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 NestedArrayLike = ArrayLike | Sequence[ArrayLike] | Sequence[Sequence[ArrayLike]]
-"""What users give for numbers: a number, an array, or lists of them."""
+"""Numbers as users give them: a number, an array, or lists of them."""
 
 
-def concrete_or_none(value: Any) -> np.ndarray | None:
+def concrete_or_none(value: object) -> np.ndarray | None:
     """The value as a NumPy array, or None while it is being traced."""
     if isinstance(value, Tracer):
         return None
+    # device_get is an explicit transfer, which a transfer guard lets through
     return np.asarray(jax.device_get(value) if isinstance(value, jax.Array) else value)
 
 
-def as_real_array(name: str, value: Any) -> Array:
-    """`value` as a floating-point array; Python numbers stay weakly typed, integers become floats, else a TypeError."""
-    with jax.transfer_guard_host_to_device("allow"):  # what a call is given goes to the device on purpose
+def as_real_array(name: str, value: object) -> Array:
+    """`value` as a floating-point array: Python numbers stay weakly typed, integers become floats, all else is a TypeError."""
+    with jax.transfer_guard_host_to_device("allow"):  # arguments of a call are transferred on purpose
         if isinstance(value, int | float) and not isinstance(value, bool):
             return jnp.asarray(float(value))
         try:
-            array = jnp.asarray(value)
+            array = jnp.asarray(value)  # pyright: ignore[reportArgumentType, reportCallIssue]  # raises for what is none
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{name}: got {_describe_value(value)}, expected real numbers or an array of them."
@@ -64,7 +65,7 @@ def demand_all(name: str, array: Array, good: ArrayLike, expected: str) -> None:
 
 def as_real_quantity(
     name: str,
-    value: Any,
+    value: object,
     *,
     above: int | float | None = None,
     at_least: int | float | None = None,
@@ -88,7 +89,7 @@ def as_real_quantity(
 
 
 def demand_direction(name: str, vector: Array) -> None:
-    """Raise a ValueError for a zero vector, which has none."""
+    """Raise a ValueError for a zero vector, which has no direction."""
     values = concrete_or_none(vector)
     if values is not None:
         demand_all(f"{name} [1]", vector, (values**2).sum(axis=-1, keepdims=True) > 0, "a vector that is not zero")
@@ -98,11 +99,11 @@ VECTOR_KINDS = ("vector", "place", "corner")
 """Kinds with one component for each dimension of space."""
 KINDS = ("number", *VECTOR_KINDS, "axial", "rotation", "tensor")
 ENTRY_AXIS_COUNT = {"lane": 0, "table": 1, "point": 1, "joint": 1, "spring": 2, "memory": 0, None: 0}
-"""Axes that a quantity has behind those of the lanes and before those of its kind."""
+"""Number of axes that a quantity has after those of the lanes and before those of its kind."""
 
 
 class Quantity(NamedTuple):
-    """What a field of a part of a scene is: its name and unit, what kind of number, what there is one of it for, its bounds.
+    """What a field of a part of a scene is: its name and unit, its kind of number, what there is one of it for, its bounds.
 
     `kind`: a "number", a "vector", a "place", a "corner" (a place of which each component bounds its own axis alone), an
     "axial" vector (a number in the plane), a "rotation" (a quaternion) or a "tensor" `(dim, dim)`.
@@ -177,9 +178,9 @@ def quantity(
 ) -> Any:
     """A field of a force, contact or path for a physical number: an array that can be swept and differentiated.
 
-    It says what it is (`kind`, `per`: see `Quantity`), so that a scene can hold it against its lanes: per lane, a number
+    It declares what it is (`kind`, `per`: see `Quantity`), so that a scene can check it against its lanes: per lane, a number
     is () or has the shape of the lanes, a vector is (dim,) or (*lanes, dim). Bounds are checked when the module is built;
-    a traced number beyond them makes its lanes NaN. Where the default is None, None means absent and passes through.
+    a traced number out of bounds makes its lanes NaN. Where the default is None, None means absent and passes through.
 
     Example:
         >>> class Engine(Force):
@@ -224,8 +225,8 @@ def _build_metadata(quantity: Quantity) -> dict[str, Any]:
     return {"unit": quantity.unit, "quantity": quantity}
 
 
-def as_positive_integer(name: str, value: Any, *, at_least: int = 1) -> int:
-    """A Python int of at least `at_least`; a count is part of the program's shape and cannot be traced."""
+def as_positive_integer(name: str, value: object, *, at_least: int = 1) -> int:
+    """A Python int of at least `at_least`; a count decides the shapes of the compiled program and cannot be traced."""
     if isinstance(value, Tracer):
         raise TypeError(
             f"{name}: got a traced value, expected a Python int: counts are shape. Pass it as a static argument."
@@ -238,7 +239,7 @@ def as_positive_integer(name: str, value: Any, *, at_least: int = 1) -> int:
 
 
 def demand_known(kind: str, name: str, names: Iterable[str]) -> str:
-    """`name` if it is one of `names`; otherwise a ValueError with the nearest ones."""
+    """`name` if it is one of `names`; otherwise a ValueError that suggests the nearest ones."""
     names = sorted(names)
     if name in names:
         return name
@@ -247,19 +248,20 @@ def demand_known(kind: str, name: str, names: Iterable[str]) -> str:
     raise ValueError(f"unknown {kind} {name!r}. {hint}")
 
 
-def _describe_value(value: Any) -> str:
+def _describe_value(value: object) -> str:
     text = repr(value)
     return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"
 
 
-def starts_outside(contact: Any, state: Any) -> Array:
-    """Which lanes start on the right side of a contact, but for rounding."""
+def starts_outside(contact: PyTree, state: PyTree) -> Array:
+    """Which lanes start on the legal side of a contact, within rounding."""
     signed_distance = contact.clearance(jnp.zeros((), state.dtype), state)
     position = jnp.where(jnp.isfinite(state.position), jnp.abs(state.position), 0.0)
+    # the distance is a difference of coordinates, whose rounding is relative to the largest of them
     return signed_distance >= -8 * float(jnp.finfo(state.dtype).eps) * jnp.max(position)
 
 
-def demand_start_outside(contact: Any, state: Any) -> None:
+def demand_start_outside(contact: PyTree, state: PyTree) -> None:
     """Raise a ValueError naming the lanes that start on the wrong side of a contact by more than rounding."""
     legal = concrete_or_none(starts_outside(contact, state))
     if legal is None or legal.all():

@@ -1,6 +1,7 @@
-"""Files and folders that are whole or absent: written under a temporary name beside their place, then renamed.
+"""Atomic files and folders: complete or absent, because they are written under a temporary name and then renamed.
 
-And what is read from them: every array of a saved run is held against what a run can be before it is believed.
+The temporary name is in the same folder, since a rename is atomic only within one file system. What is read is checked:
+every array of a saved run against what a run can be, before it is used.
 """
 
 import os
@@ -8,22 +9,27 @@ import shutil
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
 RUN_FORMAT = 1
-"""Of the files that `Trajectory.save` writes; those of the first edition do not say theirs, which is this one."""
+"""Format version of the files that `Trajectory.save` writes; files of the first edition lack it and have this one."""
+
+Verdict = bool | np.bool | np.ndarray
+"""Whether an array of a file is as it must be, or which of its entries are."""
+Demand = Callable[[str, Verdict, str], None]
+"""Raises a ValueError for the array of this name where the verdict is not true, with what was expected."""
 
 
 @contextmanager
 def write_atomically(path: str | os.PathLike, mode: str = "w", *, durable: bool = False) -> Iterator[IO]:
-    """Open a temporary file that takes the place of `path` when the block ends well, and vanishes when it does not.
+    """Open a temporary file that replaces `path` when the block ends, and is removed when the block raises.
 
-    A `durable` one is on the disk, with its name, before this returns: it outlives a machine that loses its power.
+    A `durable` one is on the disk, with its name, before this returns: it survives a power failure.
     Raises FileNotFoundError when the folder of `path` does not exist.
     """
     path = Path(path)
@@ -37,6 +43,7 @@ def write_atomically(path: str | os.PathLike, mode: str = "w", *, durable: bool 
             if durable:
                 file.flush()
                 os.fsync(file.fileno())
+        # mkstemp made it readable by its owner alone
         os.chmod(temporary, 0o666 & ~_read_umask())
         os.replace(temporary, path)
         if durable:
@@ -48,7 +55,7 @@ def write_atomically(path: str | os.PathLike, mode: str = "w", *, durable: bool 
 
 @contextmanager
 def write_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
-    """Fill a temporary folder that becomes `path` when the block ends well, and vanishes when it does not.
+    """Fill a temporary folder that becomes `path` when the block ends, and is removed when the block raises.
 
     Raises FileNotFoundError when the folder that `path` is to be in does not exist, and FileExistsError when there is
     something at `path` already, unless it is an empty folder.
@@ -71,7 +78,7 @@ def write_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def ensure_writable_folder(path: str | os.PathLike) -> Path:
-    """Create the folder if need be and make sure that files can be written there; an OSError in plain words otherwise."""
+    """Create the folder if necessary and make sure that files can be written there; an OSError in plain words otherwise."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,15 +104,16 @@ def read_arrays(path: str | os.PathLike, writer: str) -> dict[str, np.ndarray]:
 
 
 def demand_saved_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise a ValueError that names the file and the array which no run could have written."""
+    """Raise a ValueError that names the file and the array that no run could have written."""
     needed = {"time", "ok", "first_step", "save_every", "steps", "method"}
-    if any(name.startswith(("final_state.", "first_bad_step")) for name in arrays):  # those of no reference solver
+    # a run of ours: that of a reference solver has no dt
+    if any(name.startswith(("final_state.", "first_bad_step")) for name in arrays):
         needed |= {"dt"}
     missing = needed - set(arrays)
     if missing:
         raise ValueError(f"load: {file} is not a saved run: it lacks {', '.join(sorted(missing))}.")
 
-    def demand(name: str, good: Any, expected: str) -> None:
+    def demand(name: str, good: Verdict, expected: str) -> None:
         if not np.all(good):
             array = arrays[name]
             shown = f"{array}" if array.size < 5 else f"{array.dtype} of shape {array.shape}"
@@ -132,8 +140,8 @@ def demand_saved_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) 
     _demand_times(arrays, demand, steps)
 
 
-def _demand_frames(arrays: Mapping[str, np.ndarray], demand: Any, frames: int) -> None:
-    """As many frames everywhere, behind the axes of a vmap, if there was one; real numbers; finite at the end of a good run."""
+def _demand_frames(arrays: Mapping[str, np.ndarray], demand: Demand, frames: int) -> None:
+    """The same number of frames everywhere, after the axes of a vmap, if any; real numbers; finite at the end of a good run."""
     outside = arrays["first_step"].shape
     axis, ok = len(outside), arrays["ok"]
     demand("ok", ok.shape[:axis] == outside, f"a shape that begins with first_step's, {outside}")
@@ -171,8 +179,8 @@ def _demand_frames(arrays: Mapping[str, np.ndarray], demand: Any, frames: int) -
         demand("first_bad_step", good, f"whole numbers of ok's shape, {ok.shape}")
 
 
-def _demand_times(arrays: Mapping[str, np.ndarray], demand: Any, steps: int) -> None:
-    """Time that goes on, by as much as the steps take; lanes that failed may have failed for their dt."""
+def _demand_times(arrays: Mapping[str, np.ndarray], demand: Demand, steps: int) -> None:
+    """Time that increases by as much as the steps take; not checked where a lane failed, which may be because of its dt."""
     time, ok, axis = arrays["time"], arrays["ok"], arrays["first_step"].ndim
     demand("time", time.dtype.kind == "f", "real numbers")
     if "dt" in arrays:
@@ -193,7 +201,7 @@ def _demand_times(arrays: Mapping[str, np.ndarray], demand: Any, steps: int) -> 
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk; where folders cannot be opened, the system sees to that by itself."""
+    """Flush the names in a folder to the disk; a system that cannot open folders does that by itself."""
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -203,6 +211,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _read_umask() -> int:
+    """The umask of the process, which can only be read by setting it."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

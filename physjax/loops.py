@@ -1,9 +1,8 @@
-"""Steps counted and repeated, so that time does not drift and reverse mode does not fill the memory."""
+"""Counted time and repeated steps: time does not drift, and reverse mode stores √n states of n steps."""
 
 import math
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from physjax.backend import jit_is_disabled
 
@@ -22,16 +21,16 @@ LARGEST_SNAP_SHARE = 1 / 64
 
 
 def time_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Array:
-    """Time is counted, t = i dt, never accumulated: accumulation drifts by a rounding error a step."""
+    """Time is counted, t = i dt, never accumulated: accumulation drifts by a rounding error per step."""
     return step.astype(dtype) * dt
 
 
 RECORD = {"record": True}
-"""Metadata of a field that is shaped like the lanes because it is a record of them: a state, its mass, a mask, a time."""
+"""Metadata of a field that has the shape of the lanes because it records something of each: a state, mass, mask or time."""
 
 
 class Moment(eqx.Module):
-    """A time as steps count it: the start of step i, what rounding to the scene's dtype took from i dt, and what has passed.
+    """A time as steps count it: the start of step i, the rounding error of i dt in the scene's dtype, and the time since.
 
     Differences are taken before they are rounded, so that 5 ms are 5 ms after a day in float32, where the time itself is
     known to 8 ms. `moment + h` is a moment of the same step. Parts of a scene get `to_float_time(moment)`, a float.
@@ -43,7 +42,7 @@ class Moment(eqx.Module):
     elapsed: ArrayLike | None = eqx.field(default=None, metadata=RECORD)
 
     @classmethod
-    def of(cls, t: Any, dt: ArrayLike, dtype: np.dtype | None = None) -> "Moment":
+    def of(cls, t: "Time", dt: ArrayLike, dtype: np.dtype | None = None) -> "Moment":
         """A moment as it is; a time given as a float is exact, the start of a step of length dt."""
         if isinstance(t, Moment):
             return t
@@ -59,25 +58,25 @@ class Moment(eqx.Module):
         return to_float_time(self)
 
     def time_until(self, time: Array, rest: ArrayLike = 0.0) -> Array:
-        """How long it is until a time [s], given as a number and what its rounding left out; negative where it has passed."""
+        """Time until a moment [s], given as a number and its rounding error; negative where it has passed."""
         ahead = self._ahead(time, rest)
         return ahead if self.elapsed is None else ahead - self.elapsed
 
     def time_until_on_grid(self, time: Array, rest: ArrayLike = 0.0) -> Array:
-        """How long it is until a time [s], or until the end of a step that differs from it by no more than rounding."""
+        """Time until a moment [s], or until the end of a step that differs from it by no more than rounding."""
         ahead = self._ahead(time, rest)
         steps = lax.stop_gradient(ahead / self.step)
         near = jnp.round(steps)
         rounding = jnp.minimum(
             2 * float(jnp.finfo(ahead.dtype).eps) * (1 + jnp.abs(time) / self.step), LARGEST_SNAP_SHARE
         )
-        # moved as a constant, so that derivatives by the time go on
+        # shifted by a constant, so that derivatives with respect to the time remain
         move = jnp.where(jnp.abs(steps - near) <= rounding, near * self.step - ahead, 0.0)
         ahead = ahead + lax.stop_gradient(move)
         return ahead if self.elapsed is None else ahead - self.elapsed
 
     def time_since(self, time: Array, rest: ArrayLike = 0.0) -> tuple[Array, Array]:
-        """How long ago a time [s] was, and what rounding left out of that."""
+        """Time since a moment [s], and the rounding error of that."""
         whole, left = exact_sum(force_rounding(self.start), -time)
         left = left + (self.rest - rest)
         return whole, left if self.elapsed is None else left + self.elapsed
@@ -91,48 +90,48 @@ Time = ArrayLike | Moment
 
 
 def moment_at(step: Array, dt: ArrayLike, dtype: np.dtype) -> Moment:
-    """The start of a step, t = i dt, with what its rounding leaves out."""
+    """The start of a step, t = i dt, with its rounding error."""
     dt = jnp.asarray(dt, dtype)
     start, rest = exact_multiple(step, dt)
     return Moment(start, rest, dt)
 
 
-def to_float_time(t: Any) -> Any:
+def to_float_time(t: PyTree) -> PyTree:
     """The time as a float, which is what parts of a scene see."""
     if not isinstance(t, Moment):
         return t
     return t.start if t.elapsed is None else t.start + t.elapsed
 
 
-def time_for_part(part: Any, t: Any) -> Any:
-    """The time as a part of a scene gets it: the moment itself only if it asks for moments, as those of the library do."""
+def time_for_part(part: object, t: PyTree) -> PyTree:
+    """The time as a part of a scene gets it: the moment itself only if it `sees_moments`, as parts of the library do."""
     return t if getattr(part, "sees_moments", False) is True else to_float_time(t)
 
 
-def time_for_method(method: Any, t: Any) -> Any:
-    """The time as a method gets it, which may hold another: one of the user gets a float."""
+def time_for_method(method: object, t: PyTree) -> PyTree:
+    """The time as a method gets it, which may wrap another method: a user's method gets a float."""
     inner = getattr(method, "method", None)
     return t if is_library_part(method) and (inner is None or is_library_part(inner)) else to_float_time(t)
 
 
-def respond_at_float_time(response: Callable, motion: Callable, scene: Any, t: Any, dt: ArrayLike) -> Any:
+def respond_at_float_time(response: Callable, motion: Callable, scene: PyTree, t: PyTree, dt: ArrayLike) -> PyTree:
     """A user's contact response, which gets the time as a float."""
     return response(motion, scene, to_float_time(t), dt)
 
 
-def is_library_part(part: Any) -> bool:
+def is_library_part(part: object) -> bool:
     """Whether a function or a module is the library's own, which may get a moment instead of a float."""
     module = getattr(getattr(part, "function", part), "__module__", None)  # None: made by exec
     return (module or "").startswith("physjax.")
 
 
 def force_rounding(number: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The number as it is, rounded before anything is added to it: no compiler may contract both across this bound."""
+    """The number itself, rounded before anything is added to it: no compiler may fuse a product with a sum across the max."""
     return jnp.maximum(number, jnp.finfo(number.dtype).min)
 
 
 def exact_sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """a + b, and what rounding left out of it (D. E. Knuth); the derivative is that of the sum."""
+    """a + b and its rounding error (D. E. Knuth's TwoSum); the derivative is that of the sum."""
     total = a + b
     x, y, s = lax.stop_gradient((a, b, force_rounding(total)))
     part = s - x
@@ -140,9 +139,9 @@ def exact_sum(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 def exact_multiple(count: Array, number: Array) -> tuple[Array, Array]:
-    """count·number, and what rounding left out of it, for a count in 32 bits; the derivative is that of the product.
+    """count·number and its rounding error, for a count in 32 bits; the derivative is that of the product.
 
-    The parts are so short that their products are exact, in an order in which their sum is.
+    The parts have so few digits that their products are exact, and are added in an order in which their sum is exact.
     """
     dtype = number.dtype
     product = count.astype(dtype) * number
@@ -154,7 +153,7 @@ def exact_multiple(count: Array, number: Array) -> tuple[Array, Array]:
 
 
 def exact_quotient(count: Array, number: Array) -> tuple[Array, Array]:
-    """count/number, and what rounding left out of it, for a count in 32 bits; the derivative is that of the quotient."""
+    """count/number and its rounding error, for a count in 32 bits; the derivative is that of the quotient."""
     whole = count.astype(number.dtype)
     quotient = whole / number
     q, d = lax.stop_gradient((quotient, number))
@@ -165,10 +164,10 @@ def exact_quotient(count: Array, number: Array) -> tuple[Array, Array]:
     return quotient, ((rest - qb * db) + left) / d
 
 
-def float32_remainder(value: Any, known: Any = None) -> Array:
-    """What float32 cannot hold of a number that a user gives, so that a moment far from t = 0 is not moved.
+def float32_remainder(value: object, known: Array | None = None) -> Array:
+    """The rounding error of a user's number in float32, so that a moment far from t = 0 is not shifted.
 
-    Nothing where the number is float32 already; then what is `known` of it stays.
+    Zero, or what is `known` of it, where the number is float32 already.
     """
     if isinstance(value, jax.Array):
         if value.dtype == np.float64:
@@ -176,7 +175,7 @@ def float32_remainder(value: Any, known: Any = None) -> Array:
         return jnp.zeros(value.shape, np.float32) if known is None else known
     try:
         exact = np.asarray(value, np.float64)
-    except (TypeError, ValueError):  # whoever checks the number says what is wrong with it
+    except (TypeError, ValueError):  # the check of the number reports what is wrong with it
         return jnp.zeros((), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         rest = (exact - exact.astype(np.float32)).astype(np.float32)
@@ -184,7 +183,7 @@ def float32_remainder(value: Any, known: Any = None) -> Array:
 
 
 def cast_remainder(value: Array, rest: Array) -> Array:
-    """The rest of a number as its dtype has it: none where the number holds it already, or is no longer the one it is of."""
+    """The rounding error of a number in its dtype: zero where the number holds it already, or was replaced since."""
     value, rest = lax.stop_gradient((value, rest.astype(value.dtype)))
     bare = value.astype(np.float32).astype(value.dtype) == value
     half = float(jnp.finfo(np.float32).eps) / 2
@@ -192,7 +191,7 @@ def cast_remainder(value: Array, rest: Array) -> Array:
 
 
 def _split_in_three(number: Array) -> tuple[Array, Array, Array]:
-    """A number as the sum of three of a third of its digits."""
+    """A number as the sum of three with a third of its digits each."""
     bits = jnp.finfo(number.dtype)
     short = partial(lax.reduce_precision, exponent_bits=bits.nexp, mantissa_bits=bits.nmant // 3)
     first = short(number)
@@ -201,17 +200,17 @@ def _split_in_three(number: Array) -> tuple[Array, Array, Array]:
 
 
 def _split_in_two(number: Array) -> tuple[Array, Array]:
-    """A number as the sum of two of half its digits."""
+    """A number as the sum of two with half of its digits each."""
     bits = jnp.finfo(number.dtype)
     first = lax.reduce_precision(number, exponent_bits=bits.nexp, mantissa_bits=bits.nmant // 2)
     return first, number - first
 
 
-def repeat_steps(step: Callable, carry: Any, first: Array, count: int) -> Any:
+def repeat_steps(step: Callable, carry: PyTree, first: Array, count: int) -> PyTree:
     """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
     if count == 1:
         return step(first, carry)
-    if jit_is_disabled():  # a checkpoint would trace it all the same, and hide the numbers from who looks
+    if jit_is_disabled():  # a checkpoint traces in any case, and would hide the numbers from a debugger
         return reduce(lambda carry, i: step(first + i, carry), range(count), carry)
     inner = _choose_chunk_length(count) if count > 16 else count
     outer, rest = divmod(count, inner)
@@ -227,7 +226,7 @@ def repeat_steps(step: Callable, carry: Any, first: Array, count: int) -> Any:
 
 
 def _choose_chunk_length(count: int) -> int:
-    """A length for chunks of about √count: one that leaves no rest, if there is one, since a rest is compiled once more."""
+    """A chunk length of about √count, one that divides the count if possible, since a remainder compiles a second program."""
     root = math.isqrt(count)
     exact = [length for length in range(root // 2, 2 * root + 1) if count % length == 0]
     return min(exact, key=lambda length: abs(length - root), default=root)

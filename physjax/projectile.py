@@ -2,16 +2,14 @@
 
 A shot leaves with `speed` [m/s] at `angle` [rad] above the horizontal; x is forward, y up, g > 0 [m/s²]. Every argument
 is a number or an array; arrays broadcast, results follow their dtype, and everything works under `jit`, `vmap` and
-`grad`. What cannot be reached is NaN, with `ok` False where it is returned; it never raises and never harms its
-neighbours in a batch, not even their gradients. NaN angles and times are therefore taken and passed on; other numbers
-that are not finite, and g or speed <= 0, raise ValueError where they are concrete; where they are traced, the answer
-is NaN.
+`grad`. What is out of reach is NaN, with `ok` False where it is returned; it never raises and does not affect other
+entries of a batch, not even their gradients. NaN angles and times are therefore accepted and passed on; other non-finite
+numbers, and g or speed <= 0, raise ValueError where they are concrete; where they are traced, the result is NaN.
 
 At the edge of reach two solutions meet and their derivatives are infinite, with opposite signs; there the derivative is
 that of the mean of both, which is finite.
 
-The lecture prints gravity both as g = -9.8 and with -½gt² around it; here g is positive and the minus stands in the
-formula.
+The lecture has gravity both as g = -9.8 and as -½gt²; here g is positive and the minus sign is in the formula.
 """
 
 import math
@@ -43,10 +41,10 @@ __all__ = [
 ]
 
 EDGE_ROUNDINGS = 8
-"""A target beyond reach by no more than so many roundings counts as being on the edge."""
+"""A target beyond reach by no more than n units of rounding counts as being on the edge of reach."""
 
 FULL_TURN = 2 * math.pi * (1 + 1e-6)
-"""A full turn [rad], in any precision: an angle beyond it was meant in degrees."""
+"""A full turn [rad], with room for float32's rounding: a larger angle was meant in degrees."""
 
 _UNITS = {"t": "s", "speed": "m/s", "angle": "rad", "g": "m/s²"}
 
@@ -94,7 +92,7 @@ class LeastSpeed(NamedTuple):
 def position(
     t: ArrayLike, speed: ArrayLike, angle: ArrayLike, *, height: ArrayLike = 0.0, g: ArrayLike = 9.8
 ) -> Float[Array, "*lanes 2"]:
-    """Where the shot is: x = s cosθ t, y = y₀ + s sinθ t - ½gt² [m].
+    """Position: x = s cosθ t, y = y₀ + s sinθ t - ½gt² [m].
 
     Example:
         >>> print(projectile.position(1.0, speed=10.0, angle=0.0, height=4.9))
@@ -105,7 +103,7 @@ def position(
 
 
 def velocity(t: ArrayLike, speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike = 9.8) -> Float[Array, "*lanes 2"]:
-    """How it moves: v = (s cosθ, s sinθ - gt) [m/s].
+    """Velocity: v = (s cosθ, s sinθ - gt) [m/s].
 
     Example:
         >>> print(projectile.velocity(1.0, speed=10.0, angle=0.0))
@@ -116,7 +114,7 @@ def velocity(t: ArrayLike, speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike =
 
 
 def apex_time(speed: ArrayLike, angle: ArrayLike, *, g: ArrayLike = 9.8) -> Float[Array, "..."]:
-    """When it stops rising: v_y - gt = 0, so t = v_y/g [s]; negative for a shot aimed down, whose apex would lie behind it.
+    """Time of the apex: v_y - gt = 0, so t = v_y/g [s]; negative for a shot aimed down, which would have had it earlier.
 
     The lecture prints `y(t) = v_y t - g t² = 0`; it means the velocity, v(t) = v_y - g t = 0.
 
@@ -149,7 +147,7 @@ def flight_time(
     target_height: ArrayLike = 0.0,
     g: ArrayLike = 9.8,
 ) -> Float[Array, "..."]:
-    """When it comes down to the target's height: t = (v_y + √(v_y² + 2g(y₀ - y)))/g [s]; on level ground 2v_y/g.
+    """Time until it falls to the target's height: t = (v_y + √(v_y² + 2g(y₀ - y)))/g [s]; on level ground 2v_y/g.
 
     The later of the two crossings. NaN for a height that is not reached from the launch on.
 
@@ -169,7 +167,7 @@ def horizontal_range(
     target_height: ArrayLike = 0.0,
     g: ArrayLike = 9.8,
 ) -> Float[Array, "..."]:
-    """How far it comes until then: v_x times the flight time [m]; on level ground 2v_x v_y/g.
+    """Horizontal distance until it falls to the target's height: v_x times the flight time [m]; on level ground 2v_x v_y/g.
 
     Negative for angles beyond a right angle; NaN for a height that is not reached.
 
@@ -184,8 +182,8 @@ def horizontal_range(
 def angle_for_apex(apex_height: ArrayLike, speed: ArrayLike, *, height: ArrayLike = 0.0, g: ArrayLike = 9.8) -> Aim:
     """The angle whose apex is at a given height [m]: θ = asin(√(2g(h - y₀))/s), not beyond a right angle.
 
-    The lecture prints v_z under the root's sign; it is the vertical component, v_y. Written as an arctangent, which
-    keeps its digits near the vertical.
+    The lecture prints v_z under the root's sign; it is the vertical component, v_y. Computed as an
+    arctangent, which keeps its digits near the vertical.
 
     Example:
         >>> round(float(np.rad2deg(projectile.angle_for_apex(2.5, speed=14.0).angle)), 3)
@@ -193,7 +191,7 @@ def angle_for_apex(apex_height: ArrayLike, speed: ArrayLike, *, height: ArrayLik
     """
     h, s, y0, g = _check_numbers(apex_height=apex_height, speed=speed, height=height, g=g)
     rising = 2.0 * g * (h - y0)  # v_y²
-    heights = 2.0 * g * (jnp.abs(h) + jnp.abs(y0))  # and the size of what was subtracted
+    heights = 2.0 * g * (jnp.abs(h) + jnp.abs(y0))  # the scale of its rounding: what was subtracted
     up, above = _root_or_zero(rising, heights)
     forward, fast_enough = _root_or_zero(s * s - rising, s * s + heights)
     ok = above & fast_enough
@@ -234,6 +232,7 @@ def angles_for_target(distance: ArrayLike, rise: ArrayLike, speed: ArrayLike, *,
     r, rise, s, g = _check_numbers(distance=distance, rise=rise, speed=speed, g=g)
     a, b = g * r / (s * s), g * rise / (s * s)  # the formula divided by s²: a tanθ = 1 ± √(1 - 2b - a²)
     root, ok = _root_or_zero(1.0 - 2.0 * b - a * a, 1.0 + 2.0 * jnp.abs(b) + a * a)
+    # out of reach the formula is evaluated at a harmless point, or its NaN would spoil the gradients of the others
     a, b = jnp.where(ok, a, 1.0), jnp.where(ok, b, 0.0)
     here = (a == 0) & (b == 0)
     rises, runs = a * a + 2.0 * b, a * (1.0 + root)
@@ -255,14 +254,16 @@ def least_speed(distance: ArrayLike, rise: ArrayLike, *, g: ArrayLike = 9.8) -> 
     r = jnp.where(behind, -r, r)  # not abs, whose derivative at 0 is 0
     away = norm(jnp.stack([r, rise], axis=-1))
     below = rise < 0
-    square = jnp.where(below, r * r / jnp.where(below, away - rise, 1.0), away + rise)  # of which the one cancels
+    square = jnp.where(
+        below, r * r / jnp.where(below, away - rise, 1.0), away + rise
+    )  # each without cancellation on its side
     speed, _ = _root_or_zero(g * square, 0.0)
     theta = 0.25 * math.pi + 0.5 * jnp.arctan2(rise, jnp.where((r == 0) & (rise == 0), 1.0, r))
     return LeastSpeed(speed, jnp.where(behind, math.pi - theta, theta))
 
 
 def _check_numbers(**given: ArrayLike) -> tuple[Array, ...]:
-    """The numbers as arrays of one shape, bad ones refused where they are concrete and NaN where they are traced."""
+    """The numbers as arrays of one shape; bad ones raise where they are concrete and become NaN where they are traced."""
     arrays = {name: _check_number(name, value) for name, value in given.items()}
     if "angle" in arrays:
         _warn_of_degrees(concrete_or_none(arrays["angle"]))
@@ -274,7 +275,7 @@ def _check_numbers(**given: ArrayLike) -> tuple[Array, ...]:
 
 
 def _warn_of_degrees(angle: np.ndarray | None) -> None:
-    """Warn of an angle beyond a full turn, which is most often one in degrees."""
+    """Warn of an angle of more than a full turn, which is usually one in degrees."""
     if angle is not None and np.any(np.abs(angle) > FULL_TURN):
         worst = angle.flat[np.nanargmax(np.abs(angle))]
         words = f"angle [rad]: got {worst:g}, more than a full turn; expected radians. For degrees use np.deg2rad."
@@ -292,7 +293,7 @@ def _check_number(name: str, value: ArrayLike) -> Array:
 
 
 def _later_crossing(v_y: Array, y0: Array, y: Array, g: Array) -> Array:
-    """The later solution of y₀ + v_y t - ½gt² = y, NaN where it lies before the launch or nowhere."""
+    """The later solution of y₀ + v_y t - ½gt² = y; NaN where it is before the launch or does not exist."""
     fall = y0 - y
     root, crosses = _root_or_zero(v_y * v_y + 2.0 * g * fall, v_y * v_y + 2.0 * g * (jnp.abs(y0) + jnp.abs(y)))
     down = v_y < 0
@@ -301,7 +302,7 @@ def _later_crossing(v_y: Array, y0: Array, y: Array, g: Array) -> Array:
 
 
 def _root_or_zero(square: Array, scale: ArrayLike) -> tuple[Array, Array]:
-    """Its square root and whether it is real: negative only by rounding, measured against `scale`, is zero; else 1 stands in."""
+    """The square root and whether it is real: 0 where negative within rounding relative to `scale`, a stand-in of 1 beyond."""
     slack = EDGE_ROUNDINGS * float(jnp.finfo(square.dtype).eps) * scale
     real = square >= -slack
     return square_root(jnp.where(real, jnp.maximum(square, 0.0), 1.0)), real

@@ -1,4 +1,4 @@
-"""Roots of one unknown, lane by lane; their derivatives follow by the implicit function theorem."""
+"""Roots of functions of one variable, lane by lane; derivatives by the implicit function theorem."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,12 +11,12 @@ from physjax.backend import any_lane, bounded_while_loop, materialise_where
 
 
 def find_first_root(function: Callable, arguments: tuple, search: tuple) -> Array:
-    """A root x of `function(x, *arguments)` per lane, which moves with all that the function depends on: dx = -∂f/(∂f/∂x).
+    """A root x of `function(x, *arguments)` per lane, differentiable in all that the function depends on: dx = -df/(∂f/∂x).
 
     `search` holds the bracket, a guess of the values at its ends (positive at the first, negative at the last), which
-    lanes are wanted, and the tolerance. A lane whose function does not fall there keeps its root where it is.
+    lanes are wanted, and the tolerance. Where the function does not fall at the root, the derivative of the root is zero.
     """
-    # a force of the user's may close over a number that is being differentiated
+    # a user's force may close over a number that is being differentiated, of which a custom rule knows nothing
     function, closed_over = jax.closure_convert(function, search[0][0], *arguments)
     return _find_first_root(function, (*arguments, *closed_over), search)
 
@@ -45,6 +45,7 @@ def _find_bracketed_root(
     """
     (low, high), (above, below) = bracket, values
     tiny = float(jnp.finfo(low.dtype).tiny)
+    # strictly of opposite signs: a guess of zero would divide by zero below
     above, below = jnp.maximum(above, tiny), jnp.minimum(below, -tiny)
 
     def going(carry):
@@ -59,9 +60,11 @@ def _find_bracketed_root(
         b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
         width = jnp.abs(b - x)
         limit = jnp.where(width > 0, tolerance / jnp.where(width > 0, width, 1.0), 1.0)
+        # his test: interpolate only where the inverse parabola through the three points is monotonic
         xi, phi = (x - b) / (c - b), (fx - fb) / (fc - fb)
         smooth = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
         inverse = fx / (fb - fx) * fc / (fb - fc) + (c - x) / (b - x) * fx / (fc - fx) * fb / (fc - fb)
+        # at least a tolerance away from both ends, so that the bracket shrinks from both
         share = jnp.clip(jnp.where(smooth, inverse, 0.5), limit, 1 - limit)
         after = (x, b, fx, fb, share, going & (limit <= 0.5) & (fx != 0))
         return tuple(jnp.where(going, new, old) for new, old in zip(after, carry, strict=True))

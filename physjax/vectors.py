@@ -1,9 +1,9 @@
-"""Little vectors, component by component.
+"""Vectors of two or three components, computed component by component.
 
 Vectors live in the last axis of an array shaped `(*lanes, dim)`. Nothing here reduces over that axis: sums are written
-out by components, which XLA fuses into straight-line code (a generic reduction over an axis of length 3 runs 10 to 30
-times slower on CPU). Derivatives are safe where the formulas are not: the norm of a zero vector has derivative zero, to
-any order and in any nesting of forward and reverse mode.
+out by components, which XLA fuses into straight-line code (a generic reduction over an axis of length 3 is 10 to 30
+times slower on CPU). Derivatives are finite where those of the formulas are not: the norm of a zero vector has derivative
+zero, to any order and in any nesting of forward and reverse mode.
 """
 
 from typing import TypeVar
@@ -26,7 +26,7 @@ def dot(a: Float[Array, "*lanes dim"], b: Float[Array, "*lanes dim"]) -> Float[A
 
 
 def components(v: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes"]]:
-    """The components one by one: where much arithmetic alternates between vectors and numbers, XLA is faster with these."""
+    """The components one by one: XLA is faster with these where arithmetic alternates between vectors and numbers."""
     return [v[..., i] for i in range(v.shape[-1])]
 
 
@@ -35,12 +35,12 @@ def stack_components(parts: list[Float[Array, "*lanes"]]) -> Float[Array, "*lane
     return jnp.stack(parts, axis=-1)
 
 
-# What is only evaluated takes the plain root, the fastest. What is differentiated takes values that are safe themselves:
-# a loop in reverse mode drops rules of one's own, and the next derivative would be that of the plain root.
+# The functions themselves take the plain root, which is fastest. Their derivative rules are written with values that are
+# safe to differentiate again: a loop in reverse mode drops custom rules, and the next derivative would be the plain root's.
 
 
 def root_and_inverse(square: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """√s and 1/√s of numbers s >= 0; both are zero where s is, and so are all their derivatives."""
+    """√s and 1/√s of numbers s >= 0; both are zero where s is zero, and so are all their derivatives."""
     present = square > 0
     root = jnp.sqrt(jnp.where(present, square, 1.0))
     return jnp.where(present, root, 0.0), jnp.where(present, 1.0 / root, 0.0)
@@ -97,7 +97,7 @@ def cross(a: Float[Array, "*lanes 3"], b: Float[Array, "*lanes 3"]) -> Float[Arr
 
 
 def turn_left(v: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
-    """The plane's e_z × v: v turned by 90 degrees anticlockwise."""
+    """e_z × v in the plane: v rotated by 90 degrees anticlockwise."""
     return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
@@ -117,9 +117,9 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
 
 
 def add_trailing_axes(number: AnyArray, ndim: int) -> AnyArray:
-    """A number per scene with axes of length 1 behind its own, `ndim` in all, so that it meets numbers per lane.
+    """A number per scene with axes of length 1 after its own, `ndim` in all, so that it broadcasts with numbers per lane.
 
-    A scalar stays one: it meets everything as it is, and the compiled program has one operation fewer.
+    A scalar stays one: it broadcasts with everything as it is, and the compiled program has one operation fewer.
     """
     return number.reshape(number.shape + (1,) * (ndim - number.ndim)) if number.ndim else number
 
@@ -132,7 +132,7 @@ def add_leading_axes(number: AnyArray, ndim: int) -> AnyArray:
 def broadcast_vector(vector: Float[Array, "..."], like: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """One vector `(dim,)` for all lanes, or one per lane, broadcast to the shape of `like`.
 
-    Raises ValueError for a number, or a vector of another length: broadcast, it would point somewhere unmeant.
+    Raises ValueError for a number, or a vector of another length: broadcast, it would point in an unintended direction.
     """
     if vector.shape[-1:] != like.shape[-1:]:
         raise ValueError(
@@ -157,11 +157,11 @@ def axis_vector(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes
     return scale(amount, jnp.broadcast_to(axis, like.shape))
 
 
-# quaternions (w, x, y, z); by lists of components, since XLA on CPU computes a vector anew for each reader of a component
+# quaternions (w, x, y, z), as lists of components: XLA on CPU recomputes a vector for each use of a component
 
 
 def multiply_quaternions(a: list, b: list) -> list:
-    """Hamilton's product ab of quaternions in components: the turn b, then the turn a."""
+    """Hamilton's product ab of quaternions in components: the rotation b, then the rotation a."""
     w, x, y, z = a
     s, u, v, n = b
     return [
@@ -173,13 +173,13 @@ def multiply_quaternions(a: list, b: list) -> list:
 
 
 def conjugate_quaternion(q: list) -> list:
-    """The turn back, in components: (w, -x, -y, -z)."""
+    """The inverse rotation, in components: (w, -x, -y, -z)."""
     w, x, y, z = q
     return [w, -x, -y, -z]
 
 
 def rotate_components(q: list, v: list) -> list:
-    """The vector v turned by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
+    """The vector v rotated by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
     w, x, y, z = q
     a, b, c = v
     p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
@@ -187,10 +187,10 @@ def rotate_components(q: list, v: list) -> list:
 
 
 def rotate_vector(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
-    """The vector v turned by the unit quaternion q: from the body's frame to the world's, for an orientation q."""
+    """The vector v rotated by the unit quaternion q: from the body frame to the world frame, for an orientation q."""
     return stack_components(rotate_components(components(q), components(v)))
 
 
 def rotate_vector_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
-    """The vector v turned back by the unit quaternion q: from the world's frame to the body's."""
+    """The vector v rotated by the inverse of the unit quaternion q: from the world frame to the body frame."""
     return stack_components(rotate_components(conjugate_quaternion(components(q)), components(v)))

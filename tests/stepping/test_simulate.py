@@ -433,7 +433,7 @@ def kept(k):
 
 def test_a_closure_made_at_every_call_is_told_once():
     throw(pulled(1.0), record=kept(1.0))
-    with pytest.warns(UserWarning, match=r"<lambda>.*defined anew at each call.*Define it once") as told:
+    with pytest.warns(UserWarning, match=r"<lambda>.*redefined at each call.*Define it once") as told:
         throw(pulled(2.0), record=kept(2.0))
     assert [Path(one.filename).name for one in told] == ["test_simulate.py"] * 2  # the force, and what is recorded
     with warnings.catch_warnings():

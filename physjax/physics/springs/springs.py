@@ -157,11 +157,9 @@ class Springs(Force):
 
     def advance(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
         """The springs without those that are stretched beyond `breaks_at`; they stay broken."""
-        if self.limit is None:
+        if self.limit is None or self.intact is None:
             return self, state
         self._demand_nodes(state)
-        assert self.limit is not None  # `advance` is there only where springs can break
-        assert self.intact is not None
         held = []
         for slot, d in enumerate(self.topology.parts(state.position)[0]):
             L, limit = self._take_slot(slot, self.L, d), self._take_slot(slot, self.limit, d)
