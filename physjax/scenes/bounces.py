@@ -141,20 +141,16 @@ def balls_in_a_box(count: int = 64, seed: int = 0) -> Problem:
 def sled(angle: float = 0.3, g: float = 9.8) -> Problem:
     """Five sleds on a slope of 0.3 rad with dry friction: one sticks, the others slide, stop, or come back down."""
     # sleds at rest, from the start or after they have stopped, stick where μ_s > tan(angle) = 0.309
-    static = np.array([0.35, 0.20, 0.50, 0.50, 0.20])
-    kinetic = np.array([0.30, 0.10, 0.45, 0.40, 0.10])
+    static, kinetic = np.array([0.35, 0.20, 0.50, 0.50, 0.20]), np.array([0.30, 0.10, 0.45, 0.40, 0.10])
     uphill = np.array([0.0, 0.0, -2.0, 3.0, 3.0])
     slope = np.array([np.cos(angle), np.sin(angle)])
     start = 1.5 * np.arange(5.0)
+    normal, rough = (-slope[1], slope[0]), contacts.Coulomb(static, kinetic)
     sleds = Scene(
         Particles(jnp.asarray(start[:, None] * slope), jnp.asarray(uphill[:, None] * slope)),
         mass=20.0,
         forces=(forces.Gravity(g),),
-        contacts=(
-            contacts.Plane(
-                (0.0, 0.0), (-slope[1], slope[0]), restitution=0.0, coulomb=contacts.Coulomb(static, kinetic)
-            ),
-        ),
+        contacts=(contacts.Plane((0.0, 0.0), normal, restitution=0.0, coulomb=rough),),
     )
     braking, stop, down = _solve_slides(angle, g, static, kinetic, uphill)
 

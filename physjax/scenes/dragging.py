@@ -70,38 +70,33 @@ def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Proble
 
     The joints are stiff springs, the tow a soft one; the ends of the limbs slide with friction.
     """
-    mass, radius, length, middle, joints = _build_limbs()
-    moments = [inertia.capsule(*limb, axis=0).principal for limb in zip(mass, radius, length, strict=True)]
-    limbs = inertia.Inertia(mass, jnp.stack(moments))
+    limbs, radius, length, middle, joints = _build_limbs()
     towed = np.array(list(LIMBS)) == "forearm"
     hand = np.array([length[towed][0] / 2, 0.0, 0.0])
-    tow_spring = TowSpring(
-        middle[towed][0] + hand, (speed, 0.0, 0.0), soft=0.3, stiffness=1e4 * towed, damping=500.0 * towed
-    )
+    lead = {"soft": 0.3, "stiffness": 1e4 * towed, "damping": 500.0 * towed}
+    tow = rigid.AtPoint(hand, TowSpring(middle[towed][0] + hand, (speed, 0.0, 0.0), **lead))
     ends = np.multiply.outer(length, [[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
     rough = contacts.Coulomb(friction, friction)
     ground = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0, coulomb=rough)
-    dragged = Scene(
-        rigid.bodies(limbs, middle),
-        limbs,
-        (forces.Gravity(g), joints, rigid.AtPoint(hand, tow_spring)),
-        (rigid.SurfaceContact(rigid.ContactPoints(ends, radius), ground),),
-    )
+    touching = rigid.SurfaceContact(rigid.ContactPoints(ends, radius), ground)
+    dragged = Scene(rigid.bodies(limbs, middle), limbs, (forces.Gravity(g), joints, tow), (touching,))
     duration, frames = 4.0, 64
 
     def joint_error(flight):
         return jax.vmap(joints.error)(jax.tree.map(jnp.asarray, flight.state))
 
     def pace(flight):
+        mass = np.asarray(limbs.mass)
         place = mass @ flight.position[[frames // 2, -1], :, 0].T / mass.sum()
         return np.diff(place)[0] / (speed * duration / 2)
 
     def pull(flight):
         state = jax.tree.map(jnp.asarray, flight.state)
-        force = jax.vmap(lambda t, state: rigid.AtPoint(hand, tow_spring)(t, state, limbs).force)(flight.time, state)
+        force = jax.vmap(lambda t, state: tow(t, state, limbs).force)(flight.time, state)
         along, up, _ = np.asarray(force)[frames // 2 :, towed].mean(axis=(0, 1))
-        return along / (friction * (mass.sum() * g - up))
+        return along / (friction * (np.sum(limbs.mass) * g - up))
 
+    looks = [solids.capsule(*limb, axis=0) for limb in zip(radius, length, strict=True)]
     return Problem(
         dragged,
         duration=duration,
@@ -110,23 +105,19 @@ def ragdoll(speed: float = 1.5, friction: float = 0.4, g: float = 9.8) -> Proble
             Truth("moves with the mean velocity of the hand [relative]", pace, 1.0, 0.02),
             Truth("pulls with F_x/(μ(mg - F_y)) of 0.9 to 1: some of the slip is sideways [1]", pull, 0.95, 0.05),
         ),
-        looks=[solids.capsule(*limb, axis=0) for limb in zip(radius, length, strict=True)],
+        looks=looks,
         frames=frames,
     )
 
 
-def _build_limbs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, rigid.Joints]:
-    """Mass [kg], radius, length and centre [m] of each limb, lying on the ground, and the joints between them."""
+def _build_limbs() -> tuple[inertia.Inertia, np.ndarray, np.ndarray, np.ndarray, rigid.Joints]:
+    """Inertia, radius, length and centre [m] of each limb, lying on the ground, and the joints between them."""
     names = list(LIMBS)
     mass, radius, length, x, z = np.array(list(LIMBS.values())).T
     height = radius.max()
     middle = np.stack([x, np.full_like(x, height), z], axis=-1)
     pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINT_PLACES])
     where = np.array([[x, height, z] for *_, x, z in JOINT_PLACES])
-    return (
-        mass,
-        radius,
-        length,
-        middle,
-        rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0),
-    )
+    joints = rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0)
+    moments = [inertia.capsule(*limb, axis=0).principal for limb in zip(mass, radius, length, strict=True)]
+    return inertia.Inertia(mass, jnp.stack(moments)), radius, length, middle, joints

@@ -121,6 +121,7 @@ def conical_pendulum(
     def tension(flight):
         return stiffness * (np.linalg.norm(flight.position[:, 1], axis=-1) - float(string.rest_length))
 
+    inward = lambda flight: tension(flight) * np.sin(tilt(flight))  # noqa: E731
     return Problem(
         circling,
         duration=float(4 * np.pi / omega),
@@ -129,12 +130,7 @@ def conical_pendulum(
         truths=(
             Truth("is at the angle tanθ = ω²r/g [rad]", tilt, np.arctan2(omega**2 * radius, g), 1e-8),
             Truth("the tension of the string is mg/cosθ [N]", tension, pull, 1e-5),
-            Truth(
-                "its horizontal component is mω²r [N]",
-                lambda f: tension(f) * np.sin(tilt(f)),
-                mass * omega**2 * radius,
-                1e-5,
-            ),
+            Truth("its horizontal component is mω²r [N]", inward, mass * omega**2 * radius, 1e-5),
         ),
     )
 

@@ -23,9 +23,8 @@ def basketball(angle: float = 0.96, g: float = 9.8) -> Problem:
     """
     mass, radius = 0.624, 0.12
     board, ring, rim, clearance = 4.6, 4.6 - 0.375, 3.05, 0.225 - radius
-    speed = np.linspace(7.96, 8.08, 4)
+    speed, area = np.linspace(7.96, 8.08, 4), np.pi * radius**2
     launch = speed[:, None] * np.array([np.cos(angle), np.sin(angle)])
-    area = np.pi * radius**2
     shots = Scene(
         Particles(jnp.broadcast_to(jnp.asarray([0.0, 2.1]), launch.shape), jnp.asarray(launch)),
         mass=mass,
@@ -70,7 +69,7 @@ def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
     wall, goal, post, bar, edge = 9.15, 22.0, 3.66, 2.44, 1.0
     up, aside = np.radians(10.0), np.radians(16.0)
     aim = np.array([np.cos(up) * np.cos(aside), np.sin(up), np.cos(up) * np.sin(aside)])
-    area = np.pi * radius**2
+    area, rough = np.pi * radius**2, contacts.Coulomb(static=0.5, kinetic=0.4)
     ball = Scene(
         Particles(jnp.asarray([0.0, radius, 0.0]), jnp.asarray(speed * aim)),
         mass=mass,
@@ -79,11 +78,7 @@ def free_kick(speed: float = 25.0, g: float = 9.8) -> Problem:
             forces.QuadraticDrag(area, coefficient=0.25),
             forces.Magnus(area, coefficient=0.25, axis=(0.0, 1.0, 0.0)),
         ),
-        contacts=(
-            contacts.Plane(
-                (0.0, radius, 0.0), (0.0, 1.0, 0.0), restitution=0.6, coulomb=contacts.Coulomb(static=0.5, kinetic=0.4)
-            ),
-        ),
+        contacts=(contacts.Plane((0.0, radius, 0.0), (0.0, 1.0, 0.0), restitution=0.6, coulomb=rough),),
     )
     bounced = lambda flight: np.diff(flight.velocity[:, 1]) > 0  # noqa: E731
     flown = lambda flight: np.concatenate([[True], ~np.maximum.accumulate(bounced(flight))])  # noqa: E731

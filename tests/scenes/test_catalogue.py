@@ -42,7 +42,7 @@ def gallery(monkeypatch):
 def test_a_scene_is_listed_with_its_size_and_its_truths():
     entry, _ = describe_scene("balls_in_a_box")
     assert entry.size == "64 particles in 2-D, 2 s"
-    assert entry.truth.startswith("closed form; every |velocity component| is what it was")
+    assert entry.truth.startswith("closed form; every |velocity component| is conserved")
     entry, _ = describe_scene("heavy_top")
     assert entry.size == "2 bodies in 3-D, 1.96 s"
     entry, _ = describe_scene("hanging_rope")

@@ -14,7 +14,7 @@ from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.physics.springs.jacobian import LinearisedSlot, LinearisedSprings, product, spring_jacobian_coefficients
 from physjax.physics.springs.topology import SpringTopology
-from physjax.vectors import add_leading_axes, dot, norm, square_root, unit
+from physjax.vectors import AnyArray, add_leading_axes, dot, norm, square_root, unit
 
 
 class Springs(Force):
@@ -206,7 +206,7 @@ class Springs(Force):
         present = self.topology.neighbours.at(self.topology.present, slot)  # NumPy's: a constant of the program
         return add_leading_axes(present, like[0].ndim)
 
-    def _take_slot(self, slot: int, number: Array, like: list[Array]) -> Array:
+    def _take_slot(self, slot: int, number: AnyArray, like: list[Array]) -> AnyArray:
         """A number of the springs in a slot, `()` or with as many axes as the components `like` it is combined with."""
         if number.ndim == 0:
             return number
