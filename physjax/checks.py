@@ -142,9 +142,10 @@ class Quantity(NamedTuple):
 
 if TYPE_CHECKING:
     # To a type checker these are descriptors: a field is given numbers of any kind, and read as the array that `quantity`
-    # has converted them to. Checkers know of `converter=` only where it is written in the class itself.
+    # has converted them to. Checkers know of `converter=` only where it is written in the class itself. They are arrays
+    # as well, because a record that is unpacked (`position, velocity = state`) does not go through the descriptor.
 
-    class Numbers:
+    class Numbers(Array):
         """The annotation of a field made with `quantity`: any numbers are given, an array is read."""
 
         def __get__(self, instance: object, owner: type | None = None) -> Array: ...
@@ -156,9 +157,11 @@ if TYPE_CHECKING:
         def __get__(self, instance: object, owner: type | None = None) -> Array | None: ...
         def __set__(self, instance: object, value: NestedArrayLike | None) -> None: ...
 
+    Vectors = Numbers
 else:
     Numbers = Float[Array, "..."]
     OptionalNumbers = Float[Array, "..."] | None
+    Vectors = Float[Array, "*lanes dim"]
 
 
 def quantity(

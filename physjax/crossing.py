@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import any_lane
-from physjax.checks import quantity
+from physjax.checks import Numbers, quantity
 from physjax.closures import warn_of_recompilation
 from physjax.cubics import Cubic
 from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
@@ -42,7 +42,7 @@ class Crossing(NamedTuple):
 class Height(eqx.Module):
     """All places at one height [m] along the axis `up`, a number or one per lane; in one dimension the coordinate itself."""
 
-    height: Float[Array, "..."] = quantity("height", "m")
+    height: Numbers = quantity("height", "m")
     up: int = eqx.field(static=True, default=1)
 
     def signed_distance(self, t: Time, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:

@@ -142,7 +142,7 @@ def _triangulate(name: str, vertices: np.ndarray, polygons: Polygons) -> np.ndar
     lengths, fans = np.array([len(polygon) for polygon in polygons]), list(polygons)
     for length in np.unique(lengths[lengths > 3]):
         which = np.flatnonzero(lengths == length)
-        corners = np.array([polygons[i] for i in which], np.int64)
+        corners = np.array([polygons[int(i)] for i in which], np.int64)
         # indices out of range are refused later, by the check that triangles go through
         known = ((corners >= 0) & (corners < len(vertices))).all(axis=1)
         begun = _find_fan_starts(vertices[corners[known]])

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.checks import as_real_array, as_real_quantity
+from physjax.checks import Vectors, as_real_array, as_real_quantity
 from physjax.loops import Time, time_for_part, to_float_time
 from physjax.vectors import dot, scale
 
@@ -95,8 +95,9 @@ class Particles(NamedTuple):
         (10000,)
     """
 
-    position: Float[Array, "*lanes dim"]
-    velocity: Float[Array, "*lanes dim"]
+    # NumPy arrays and lists may be given as well: `validate` converts them, and an exact path has NumPy arrays
+    position: Vectors
+    velocity: Vectors
 
     @property
     def lanes(self) -> tuple[int, ...]:

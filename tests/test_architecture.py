@@ -135,6 +135,23 @@ def test_no_file_is_over_400_lines(file):
     assert len(FILES[file].read_text(encoding="utf-8").splitlines()) <= 400
 
 
+def documented_constants(tree):
+    """Module-level numbers in capitals, each with whether a docstring behind it gives the reason."""
+    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name | ast.Tuple):
+            names = [name.id for name in ast.walk(node.targets[0]) if isinstance(name, ast.Name)]
+            numbers = [
+                c.value for c in ast.walk(node.value) if isinstance(c, ast.Constant) and type(c.value) in (int, float)
+            ]
+            if names[0].isupper() and numbers:
+                yield names, isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if room(file) != "scenes"])
+def test_every_number_that_is_named_has_its_reason_behind_it(file):
+    assert [names for names, documented in documented_constants(TREES[file]) if not documented] == []
+
+
 def public(node):
     return isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_")
 

@@ -46,7 +46,7 @@ def _run_aim(options: argparse.Namespace) -> None:
             print("The target is out of reach: these are the nearest misses.")
         matplotlib.use("Agg")
         with write_atomically(folder / "aim.png", "wb") as file:
-            aimed.plot().figure.savefig(file, dpi=125)
+            aimed.plot().figure.savefig(file, dpi=125)  # pyright: ignore[reportAttributeAccessIssue]  # ours are in a figure, not in a subfigure
     print(f"Picture: {folder / 'aim.png'}")
 
 

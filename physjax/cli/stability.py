@@ -33,6 +33,7 @@ def _run_stability(name: str, out: str, steps: int) -> None:
     from physjax.particles import callable_name
     from physjax.scenes import FAILURES, SCENES
     from physjax.study import stability
+    from physjax.study.problem import Problem
     from physjax.study.stability.survey import find_fastest_moment
     from physjax.text import describe_machine, format_seconds
 
@@ -42,7 +43,7 @@ def _run_stability(name: str, out: str, steps: int) -> None:
     with jax.enable_x64(True):
         problem = (SCENES | FAILURES)[name]()
     scene = problem.scene
-    time, at = find_fastest_moment(problem) if name in SCENES else (0.0, scene.state)
+    time, at = find_fastest_moment(problem) if isinstance(problem, Problem) else (0.0, scene.state)
     unstable = bool(stability.grows_by_itself(scene, at).any())
     limits = _print_limits(name, scene, at, None if unstable else steps)
     print(f"Linearised about the state at t = {time:.4g} s, where the scene is fastest.")

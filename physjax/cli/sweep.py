@@ -60,7 +60,8 @@ def _run_sweep(options: argparse.Namespace) -> None:
         found.save(folder / "sweep.npz")
         drawn = found.plot(outcome, labels={outcome: words})
         with write_atomically(folder / "sweep.png", "wb") as file:
-            (drawn if isinstance(drawn, Figure) else drawn.figure).savefig(file, dpi=125)
+            figure = drawn if isinstance(drawn, Figure) else drawn.figure
+            figure.savefig(file, dpi=125)  # pyright: ignore[reportAttributeAccessIssue]  # ours are in a figure, not in a subfigure
     print(f"{words}: {folder / 'sweep.npz'}, {folder / 'sweep.png'}")
 
 

@@ -100,7 +100,7 @@ def hanging_cloth(nodes: int = 7, side: float = 0.5, mass: float = 0.1, g: float
             Truth("the nails carry the weight of the other nodes [N]", _measure_pinned_load, weight, 1e-6),
             Truth(
                 "left and right mirror each other [m]",
-                lambda f: f.position - f.position[:, mirrored] * [-1.0, 1.0, 1.0],
+                lambda f: f.position - f.position[:, mirrored] * np.array([-1.0, 1.0, 1.0]),
                 0.0,
                 1e-9,
             ),
@@ -226,7 +226,8 @@ def _momentum_residual(flight):
     """Change of momentum from start to end, less the impulse of all forces on the free nodes [kg m/s]."""
     mass, free = np.asarray(flight.scene.mass)[:, None], ~np.asarray(flight.scene.pinned)
     change = np.sum(mass * (flight.velocity[-1] - flight.velocity[0]), axis=0)
-    return change - _integrate(flight.time, sum(_evaluate_terms(flight))[:, free].sum(axis=1))
+    total = np.asarray(sum(_evaluate_terms(flight)))
+    return change - _integrate(flight.time, total[:, free].sum(axis=1))
 
 
 def _energy_residual(flight):

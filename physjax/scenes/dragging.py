@@ -58,8 +58,11 @@ class TowSpring(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The pull [N]."""
-        (x, v), begun = state, 1 - jnp.exp(-t / self.soft)
-        place = broadcast_vector(self.start, x) + scale(t - self.soft * begun, broadcast_vector(self.velocity, v))
+        x, v = state
+        begun = 1 - jnp.exp(-t / self.soft)  # pyright: ignore[reportOperatorIssue]  # a time is no boolean, which has no minus
+        place = broadcast_vector(self.start, x) + scale(
+            jnp.subtract(t, self.soft * begun), broadcast_vector(self.velocity, v)
+        )
         slip = scale(begun, broadcast_vector(self.velocity, v)) - v
         return scale(self.stiffness, place - x) + scale(self.damping, slip)
 

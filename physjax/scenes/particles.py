@@ -110,7 +110,7 @@ def fire(rate: float = 400.0, rise: float = 1.5, eddies: float = 0.3) -> Problem
     gas, rises = _build_hot_gas(flame, rise, 0.01, eddies, 0.5)
 
     def light(flight):
-        return np.sum(flight.final_scene.emitter.appearance(flight.time[-1]).opacity)
+        return np.sum(_final_emitter(flight).appearance(flight.time[-1]).opacity)
 
     mean = np.mean((np.asarray(brightness[1:]) + np.asarray(brightness[:-1])) / 2)
     steady = Truth("the light is rate × life × mean opacity [1]", light, rate * life * mean, max(brightness))
@@ -141,7 +141,7 @@ def sparks(rate: float = 250.0, speed: float = 3.0, restitution: float = 0.5, co
     flying = Scene(wheel.unborn(), 1e-6, (forces.Gravity(g),), (floor,), emitter=wheel)
 
     def off_newton(flight):
-        emitter, now = flight.final_scene.emitter, flight.time[-1]
+        emitter, now = _final_emitter(flight), flight.time[-1]
         seen = emitter.appearance(now)
         return np.abs(np.asarray(seen.opacity) - np.exp(-np.asarray(emitter.age(now)) / cooling))[seen.alive].max()
 
@@ -172,7 +172,7 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
     def path_error(flight):
         """Flakes are born at their terminal speed, and reach the velocity of the wind with the time constant m/b."""
         age, _ = _read_ages(flight)
-        emitter = flight.final_scene.emitter
+        emitter = _final_emitter(flight)
         start = np.asarray(emitter.births(emitter.slot, emitter.generation).position)
         down = np.minimum(age, start[:, 1] / fall)
         lag = fall / g
@@ -193,7 +193,7 @@ def snow(rate: float = 100.0, fall: float = 1.0, wind: float = 0.5) -> Problem:
 
 def _read_ages(flight: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Age [s] of the particles alive at the end, 0 of all others, and the velocity each was born with [m/s]."""
-    emitter, now = flight.final_scene.emitter, flight.time[-1]
+    emitter, now = _final_emitter(flight), flight.time[-1]
     age = np.where(emitter.alive(now), emitter.age(now), 0.0)
     return age, np.asarray(emitter.births(emitter.slot, emitter.generation).velocity)
 
@@ -249,6 +249,13 @@ def _build_alive_truth(expected: float) -> Truth:
     """In the steady state the number of particles alive is rate times life."""
 
     def count(flight):
-        return np.sum(flight.final_scene.emitter.alive(flight.time[-1]))
+        return np.sum(_final_emitter(flight).alive(flight.time[-1]))
 
     return Truth("the number alive is rate times life", count, expected, 1.0)
+
+
+def _final_emitter(flight: Trajectory) -> emitters.Emitter:
+    """The emitter at the end, with what is alive then."""
+    emitter = None if flight.final_scene is None else flight.final_scene.emitter
+    assert isinstance(emitter, emitters.Emitter)
+    return emitter

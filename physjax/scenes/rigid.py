@@ -201,7 +201,9 @@ def _body_axis(flight: Trajectory) -> np.ndarray:
 def _body_angular_velocity(flight: Trajectory) -> np.ndarray:
     """The angular velocity in the body frame, at every frame [rad/s]."""
     states = jax.tree.map(jnp.asarray, flight.state)
-    omega = jax.vmap(lambda state: rigid.angular_velocity(state, flight.scene.mass))(states)
+    assert flight.scene is not None
+    mass = flight.scene.mass
+    omega = jax.vmap(lambda state: rigid.angular_velocity(state, mass))(states)
     return np.asarray(rotate_vector_back(states.orientation, omega))
 
 

@@ -131,10 +131,12 @@ def _slope_direction(slope: float) -> np.ndarray:
 
 def _velocity(flight: Trajectory) -> np.ndarray:
     """Velocity of the centres of mass at every frame [m/s]."""
+    assert flight.scene is not None
     return flight.state.momentum / flight.scene.mass.mass
 
 
 def _omega(flight: Trajectory) -> np.ndarray:
     """Angular velocity at every frame [rad/s]."""
+    assert flight.scene is not None
     states, mass = (jax.tree.map(jnp.asarray, part) for part in (flight.state, flight.scene.mass))
     return np.asarray(jax.vmap(lambda state: rigid.angular_velocity(state, mass))(states))

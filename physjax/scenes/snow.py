@@ -108,6 +108,8 @@ def _solve_flights(hill: Hill, energy: np.ndarray, g: float) -> tuple[np.ndarray
 
 def _find_landings(flight: Trajectory) -> np.ndarray:
     """Where each landed [m]: from the last frame before, at constant velocity for the time that is left."""
+    assert flight.final_scene is not None
     since = np.asarray(flight.final_scene.contacts[0].touching_since)
     last, lane = np.searchsorted(flight.time, since) - 1, np.arange(since.size)
-    return flight.position[last, lane, 0] + flight.velocity[last, lane, 0] * (since - flight.time[last])
+    position, velocity = np.asarray(flight.position), np.asarray(flight.velocity)
+    return position[last, lane, 0] + velocity[last, lane, 0] * (since - flight.time[last])

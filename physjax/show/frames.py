@@ -11,6 +11,7 @@ from physjax.physics.springs.springs import Springs
 from physjax.trajectory import Trajectory
 
 DAY_SECONDS = 86400.0
+"""A run longer than a few of these has its time written in days."""
 MIN_DURATION_SECONDS = 1e-12
 """A run of a single frame has no duration; its time is then written with all the decimals that a title may have."""
 

@@ -15,10 +15,13 @@ Json = dict[str, Any]
 POINTS, LINES, TRIANGLES = 0, 1, 4
 """What a primitive is made of, as glTF numbers it."""
 _FLOAT, _UINT = 5126, 5125
+"""Component types, as glTF numbers them."""
 _VERTICES, _INDICES = 34962, 34963
+"""Targets of a buffer view, as glTF numbers them."""
 _UPRIGHT_ROTATIONS = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 """The turn by a right angle that brings x, about z, or z, about x, to y."""
 _ACCESSOR_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
+"""What glTF calls the entries of an array, by their shape."""
 
 
 class Document:

@@ -5,9 +5,8 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
 
-from physjax.checks import as_real_quantity
+from physjax.checks import NestedArrayLike, as_real_quantity
 from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import RigidBodies
@@ -29,12 +28,14 @@ MIN_EDGE_SHARE = 0.02
 MIN_AREA_SHARE = 1e-12
 """A triangle with an area below this share of the square of the shape's size has collapsed to a line, as at a pole."""
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""The corners of a cube of edge 1 about the origin."""
 _CUBE_FACES = np.array(
     [
         *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
         *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
     ]
 )
+"""The twelve triangles of that cube, counterclockwise seen from outside."""
 
 
 class Shape(NamedTuple):
@@ -43,7 +44,7 @@ class Shape(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
 
-    def at(self, place: ArrayLike) -> "Shape":
+    def at(self, place: NestedArrayLike) -> "Shape":
         """The shape moved by a vector [m] in the frame of the body."""
         return self._replace(vertices=self.vertices + np.asarray(place, float))
 
@@ -54,7 +55,7 @@ class Shape(NamedTuple):
         return Shape(np.concatenate(vertices), np.concatenate([f + s for f, s in zip(faces, starts, strict=True)]))
 
 
-def box(size: ArrayLike) -> Shape:
+def box(size: NestedArrayLike) -> Shape:
     """A box with edges along the axes [m], `(3,)`."""
     return Shape(_CUBE * np.asarray(as_real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
 

@@ -22,7 +22,10 @@ from physjax.stepping.registry import PromisingMethod
 from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
 from physjax.vectors import norm
 
-SAFETY_FACTOR, LECTURE_SAFETY_FACTOR, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR = 0.8, 0.9, 0.2, 5.0
+SAFETY_FACTOR, LECTURE_SAFETY_FACTOR = 0.8, 0.9
+"""The next step relative to the one that would just keep the tolerance: ours rejects fewer steps than the lecture's."""
+SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR = 0.2, 5.0
+"""Bounds of the next step relative to the last: one estimate of the error is not trusted further."""
 NEGLIGIBLE_ERROR = 1e-10
 """An error, in units of the tolerance, that counts as none."""
 SHORTEST_STEP_SHARE = 1e-6

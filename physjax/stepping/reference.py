@@ -73,21 +73,9 @@ def reference(
         [[ 0.  10. ]
          [ 3.   9.1]]
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"reference: got a {type(scene).__name__}, expected a Scene.")
-    times = np.asarray(times, float)
-    if times.ndim != 1 or not times.size or not np.isfinite(times).all() or times[0] < 0 or (np.diff(times) <= 0).any():
-        raise ValueError("reference: times must be a list of ascending finite numbers >= 0 [s].")
+    times = _check_problem(scene, times)
     as_real_quantity("rtol", rtol, above=0.0)
     as_real_quantity("atol", atol, above=0.0)
-    if scene.emitter is not None or scene.remembers:
-        raise ValueError(
-            "reference: the scene has parts with memory, which an ordinary differential equation has not. Remove them."
-        )
-    if scene.contacts:
-        raise ValueError(
-            "reference: the scene has contacts, which an ordinary differential equation has not. Remove them."
-        )
     with jax.enable_x64(True):
         scene = cast_floats(scene, jnp.float64)
         end = jnp.asarray(max(times[-1], 1e-300))
@@ -110,6 +98,30 @@ def reference(
         save_every=1,
         steps=times.size - 1,
     )
+
+
+def _check_problem(scene: Scene, times: ArrayLike | Sequence[float]) -> np.ndarray:
+    """The times, if they ascend and the scene is an ordinary differential equation."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"reference: got a {type(scene).__name__}, expected a Scene.")
+    moments = np.asarray(times, float)
+    if (
+        moments.ndim != 1
+        or not moments.size
+        or not np.isfinite(moments).all()
+        or moments[0] < 0
+        or (np.diff(moments) <= 0).any()
+    ):
+        raise ValueError("reference: times must be a list of ascending finite numbers >= 0 [s].")
+    if scene.emitter is not None or scene.remembers:
+        raise ValueError(
+            "reference: the scene has parts with memory, which an ordinary differential equation has not. Remove them."
+        )
+    if scene.contacts:
+        raise ValueError(
+            "reference: the scene has contacts, which an ordinary differential equation has not. Remove them."
+        )
+    return moments
 
 
 def build_default_solver() -> Any:

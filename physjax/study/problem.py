@@ -1,11 +1,12 @@
 """A scene with its own truth: how long to run it, what must hold, and how that is known."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.scene import Scene
@@ -14,6 +15,9 @@ from physjax.stepping.reference import cast_floats, reference
 from physjax.stepping.simulate import simulate
 from physjax.study.energy.quantities import Conserved
 from physjax.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from physjax.show.drawables import Look  # with what draws it, which a run does without
 
 REFERENCE_STEPS_PER_FRAME = 64
 """Steps of rk4 between two moments at which errors are measured, where diffrax cannot be the reference."""
@@ -31,9 +35,9 @@ class Truth(NamedTuple):
     """
 
     statement: str
-    measure: Callable[[Trajectory], np.ndarray]
-    expected: np.ndarray | float
-    tolerance: np.ndarray | float
+    measure: Callable[[Trajectory], ArrayLike]
+    expected: np.ndarray | np.floating | float
+    tolerance: np.ndarray | np.floating | float
 
 
 class Problem(NamedTuple):
@@ -50,7 +54,7 @@ class Problem(NamedTuple):
     conserved: tuple[Conserved, ...] = ()
     truths: tuple[Truth, ...] = ()
     frames: int = 32
-    looks: object = None
+    looks: "Look | None" = None
 
     @property
     def times(self) -> np.ndarray:

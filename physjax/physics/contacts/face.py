@@ -7,8 +7,9 @@ alone: it is searched for impacts like a surface that lies a radius higher, and 
 from typing import Any, Protocol, runtime_checkable
 
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
+from physjax.checks import OptionalNumbers
 from physjax.particles import Particles
 from physjax.physics.contacts.restitution import Material
 
@@ -56,8 +57,8 @@ class Face(Protocol):
 class ContactFace(Face, Material, Protocol):
     """A surface that particles can rest on: its geometry with its curvature, restitution and friction."""
 
-    velocity: Float[Array, "..."] | None
-    touching_since: Float[Array, "..."] | None
+    velocity: OptionalNumbers
+    touching_since: OptionalNumbers
 
     def facing(self, t: ArrayLike, position: Array) -> "ContactFace":
         """The surface as a lane at this position meets it."""

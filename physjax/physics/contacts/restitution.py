@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import concrete_or_none, demand_all, quantity
+from physjax.checks import Numbers, OptionalNumbers, concrete_or_none, demand_all, quantity
 from physjax.particles import Particles
 from physjax.vectors import dot, scale
 
@@ -26,8 +26,8 @@ class Coulomb(eqx.Module):
         [1. 0.]
     """
 
-    static: Float[Array, "..."] = quantity("static friction μ_s", "1", at_least=0)
-    kinetic: Float[Array, "..."] = quantity("kinetic friction μ_k", "1", at_least=0)
+    static: Numbers = quantity("static friction μ_s", "1", at_least=0)
+    kinetic: Numbers = quantity("kinetic friction μ_k", "1", at_least=0)
 
     def __check_init__(self):
         static, kinetic = concrete_or_none(self.static), concrete_or_none(self.kinetic)
@@ -45,8 +45,8 @@ class Coulomb(eqx.Module):
 class Material(Protocol):
     """What a contact needs to know of a surface besides its geometry."""
 
-    restitution: Float[Array, "..."]
-    friction: Float[Array, "..."] | None
+    restitution: Numbers
+    friction: OptionalNumbers
     coulomb: Coulomb | None
 
 

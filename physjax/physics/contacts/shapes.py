@@ -13,7 +13,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import concrete_or_none, demand_all, demand_direction, quantity
+from physjax.checks import Numbers, concrete_or_none, demand_all, demand_direction, quantity
 from physjax.cubics import Cubic
 from physjax.particles import Particles, sum_terms
 from physjax.physics.contacts.face import LowestPoint
@@ -41,8 +41,8 @@ class Plane(Surface):
     """
 
     curved: ClassVar[bool] = False
-    point: Float[Array, "..."] = quantity("point of the plane", "m", kind="place")
-    normal: Float[Array, "..."] = quantity("normal of the plane", "1", kind="vector")
+    point: Numbers = quantity("point of the plane", "m", kind="place")
+    normal: Numbers = quantity("normal of the plane", "1", kind="vector")
 
     def __check_init__(self):
         demand_direction("normal of the plane", self.normal)
@@ -71,9 +71,9 @@ class Slab(Surface):
     """
 
     curved: ClassVar[bool] = False
-    point: Float[Array, "..."] = quantity("point in the middle of the slab", "m", kind="place")
-    normal: Float[Array, "..."] = quantity("normal of the slab", "1", kind="vector")
-    thickness: Float[Array, "..."] = quantity("thickness", "m", above=0)
+    point: Numbers = quantity("point in the middle of the slab", "m", kind="place")
+    normal: Numbers = quantity("normal of the slab", "1", kind="vector")
+    thickness: Numbers = quantity("thickness", "m", above=0)
     inside: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
@@ -142,8 +142,8 @@ class Sphere(Surface):
         6.0
     """
 
-    center: Float[Array, "..."] = quantity("center", "m", kind="place")
-    radius: Float[Array, "..."] = quantity("radius", "m", above=0)
+    center: Numbers = quantity("center", "m", kind="place")
+    radius: Numbers = quantity("radius", "m", above=0)
     inside: bool = eqx.field(static=True, default=False)
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
@@ -220,8 +220,8 @@ class Room(Surface):
     """
 
     curved: ClassVar[bool] = False
-    lower: Float[Array, "..."] = quantity("lower corner", "m", kind="corner")
-    upper: Float[Array, "..."] = quantity("upper corner", "m", kind="corner")
+    lower: Numbers = quantity("lower corner", "m", kind="corner")
+    upper: Numbers = quantity("upper corner", "m", kind="corner")
 
     def __check_init__(self):
         lower, upper = concrete_or_none(self.lower), concrete_or_none(self.upper)

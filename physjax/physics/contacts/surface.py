@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import KW_ONLY, replace
 from typing import ClassVar, TypeVar
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.checks import quantity, unchecked_quantity
+from physjax.checks import Numbers, OptionalNumbers, quantity, unchecked_quantity
 from physjax.old_names import serve_old_names
 from physjax.particles import Particles
 from physjax.parts import Contact
@@ -52,18 +52,13 @@ class Surface(Contact):
     """
 
     curved: ClassVar[bool] = True
-    restitution: Float[Array, "..."] = quantity(
-        "restitution K_r", "1", at_least=0, at_most=1, default=1.0, kw_only=True
-    )
-    friction: Float[Array, "..."] | None = quantity(
-        "friction K_f", "1", at_least=0, at_most=1, default=None, kw_only=True
-    )
+    _: KW_ONLY  # type checkers do not see the kw_only of `quantity`
+    restitution: Numbers = quantity("restitution K_r", "1", at_least=0, at_most=1, default=1.0, kw_only=True)
+    friction: OptionalNumbers = quantity("friction K_f", "1", at_least=0, at_most=1, default=None, kw_only=True)
     coulomb: Coulomb | None = eqx.field(default=None, kw_only=True)
-    velocity: Float[Array, "..."] | None = quantity(
-        "surface velocity", "m/s", kind="vector", default=None, kw_only=True
-    )
+    velocity: OptionalNumbers = quantity("surface velocity", "m/s", kind="vector", default=None, kw_only=True)
     response: Callable[..., Scene] | None = eqx.field(static=True, default=None, kw_only=True)
-    touching_since: Float[Array, "..."] | None = unchecked_quantity(
+    touching_since: OptionalNumbers = unchecked_quantity(
         "begin of contact", "s", per="memory", default=None, kw_only=True
     )
 

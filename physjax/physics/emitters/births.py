@@ -4,7 +4,7 @@ No random state is carried: birth number n has the same numbers whatever was bor
 run was resumed.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from physjax.loops import force_rounding
+
+if TYPE_CHECKING:
+    from physjax.checks import Numbers as Key  # a seed or a key is given, words are read
+else:
+    Key = UInt32[Array, "words"]
 
 DRAWS_PER_BIRTH = 8
 """Uniform numbers per birth: three for the place, two for the direction, then speed, life and size."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
 from physjax.backend import compact_and_apply_runs, materialise
 from physjax.checks import (
@@ -43,7 +43,7 @@ from physjax.loops import (
 from physjax.particles import Particles, demand_particles
 from physjax.parts import ParticleSource
 from physjax.physics.emitters.appearance import Appearance, Look
-from physjax.physics.emitters.births import Birth, apply_spread, draw_uniforms, read_key
+from physjax.physics.emitters.births import Birth, Key, apply_spread, draw_uniforms, read_key
 from physjax.physics.emitters.shapes import Source, direction_in_cone, unit_direction
 from physjax.scene import Scene
 from physjax.vectors import add_trailing_axes, broadcast_vector, components, scale, stack_components
@@ -79,7 +79,7 @@ class Emitter(ParticleSource):
 
     pool: int = eqx.field(static=True, converter=lambda value: as_positive_integer("pool", value))
     source: Source
-    key: UInt32[Array, "words"] = unchecked_quantity("key", per=None, converter=read_key, kw_only=True)
+    key: Key = unchecked_quantity("key", per=None, converter=read_key, kw_only=True)
     life: Numbers = quantity("life", "s", per=None, above=0, kw_only=True)
     speed: Numbers = quantity("speed", "m/s", per=None, default=0.0, kw_only=True)
     rate: OptionalNumbers = quantity("rate", "1/s", per=None, above=0, default=None, kw_only=True)

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import as_real_quantity, unchecked_quantity
+from physjax.checks import Numbers, as_real_quantity, unchecked_quantity
 from physjax.physics.rigid.spatial import RigidBodies, to_world_frame
 from physjax.vectors import scale
 
 _CORNERS = tuple(product((-1.0, 1.0), repeat=3))
+"""The corners of a cube, in half its edges from its centre."""
 
 
 class ContactPoints(eqx.Module):
@@ -31,7 +32,7 @@ class ContactPoints(eqx.Module):
     """
 
     points: Float[Array, "*lanes points 3"] = unchecked_quantity("points of the hull", "m", kind="place", per="point")
-    radius: Float[Array, "..."] = unchecked_quantity("radius of the hull", "m", at_least=0)
+    radius: Numbers = unchecked_quantity("radius of the hull", "m", at_least=0)
 
     def __init__(self, points: ArrayLike | Sequence, radius: ArrayLike = 0.0):
         self.points = as_real_quantity("points of the hull [m]", points)

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from numpy.linalg import eigh
 
-from physjax.checks import as_real_quantity, concrete_or_none, demand_all, unchecked_quantity
+from physjax.checks import Numbers, as_real_quantity, concrete_or_none, demand_all, unchecked_quantity
 from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia_tensors import (
     demand_closed,
@@ -41,7 +41,7 @@ class Inertia(eqx.Module):
         [13.0, 10.0, 5.0]
     """
 
-    mass: Float[Array, "..."] = unchecked_quantity("mass", "kg", above=0)
+    mass: Numbers = unchecked_quantity("mass", "kg", above=0)
     principal: Float[Array, "*lanes 3"] = unchecked_quantity("principal moments", "kg m²", kind="vector", at_least=0)
     axes: Float[Array, "*lanes 4"] | None = unchecked_quantity("axes", kind="rotation")
     arm: Float[Array, "*lanes 3"] | None = unchecked_quantity("arm of the pivot", "m", kind="vector")
@@ -121,7 +121,7 @@ class Solid(NamedTuple):
 # closed forms
 
 
-def box(mass: ArrayLike, size: ArrayLike) -> Inertia:
+def box(mass: ArrayLike, size: ArrayLike | Sequence) -> Inertia:
     """A box with edges a, b, c [m] along the axes: I = m/12 (b² + c², c² + a², a² + b²).
 
     Example:
@@ -191,7 +191,7 @@ def capsule(mass: ArrayLike, radius: ArrayLike, length: ArrayLike, *, axis: int 
 # from a full tensor
 
 
-def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
+def of_tensor(mass: ArrayLike, tensor: ArrayLike | Sequence) -> Inertia:
     """The inertia of a full symmetric tensor in the body frame [kg m²], `(3, 3)` or per lane; diagonalised on the host.
 
     Example:
@@ -216,7 +216,7 @@ def of_tensor(mass: ArrayLike, tensor: ArrayLike) -> Inertia:
     return Inertia(mass, principal, find_quaternion(columns * right_handed[..., None, None]))
 
 
-def points(masses: ArrayLike, positions: ArrayLike) -> Solid:
+def points(masses: ArrayLike | Sequence, positions: ArrayLike | Sequence) -> Solid:
     """Point masses [kg] `(n,)` held together at positions [m] `(n, 3)`: I = Σ m (|r|² 1 - r rᵀ).
 
     Example:

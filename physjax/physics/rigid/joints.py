@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import as_real_quantity, quantity, unchecked_quantity
+from physjax.checks import Numbers, as_real_quantity, quantity, unchecked_quantity
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity, to_world_frame
 from physjax.vectors import cross, dot, norm, scale
@@ -32,8 +32,8 @@ class Joints(Load):
     couples: ClassVar[bool] = True
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
-    stiffness: Float[Array, "..."] = quantity("stiffness k", "N/m", per="joint", above=0)
-    damping: Float[Array, "..."] = quantity("damping c", "kg/s", per="joint", at_least=0)
+    stiffness: Numbers = quantity("stiffness k", "N/m", per="joint", above=0)
+    damping: Numbers = quantity("damping c", "kg/s", per="joint", at_least=0)
 
     def __init__(
         self,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import as_real_quantity, quantity
+from physjax.checks import Numbers, as_real_quantity, quantity
 from physjax.loops import Time
 from physjax.particles import Particles
 from physjax.parts import Force, adopt_force
@@ -127,7 +127,7 @@ class Torque(Load):
         [0. 0. 5.]
     """
 
-    torque: Float[Array, "..."] = quantity("torque", "N m", kind="vector")
+    torque: Numbers = quantity("torque", "N m", kind="vector")
     frame: str = eqx.field(static=True, default="world")
 
     def __check_init__(self):
@@ -150,7 +150,7 @@ class RotationalDrag(Load):
         [-0. -0. -1.]
     """
 
-    coefficient: Float[Array, "..."] = quantity("drag coefficient c", "N m s", at_least=0)
+    coefficient: Numbers = quantity("drag coefficient c", "N m s", at_least=0)
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The torque, and no force."""
@@ -166,8 +166,8 @@ class Thrust(Load):
         [3. 0. 0.] [ 0.  0. -6.]
     """
 
-    force: Float[Array, "..."] = quantity("thrust", "N", kind="vector")
-    point: Float[Array, "..."] = quantity("point of the body", "m", kind="place", default=(0.0, 0.0, 0.0))
+    force: Numbers = quantity("thrust", "N", kind="vector")
+    point: Numbers = quantity("point of the body", "m", kind="place", default=(0.0, 0.0, 0.0))
 
     def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
@@ -188,7 +188,7 @@ class AtPoint(Load):
         [ 0.  0. -6.]
     """
 
-    point: Float[Array, "..."] = quantity("point of the body", "m", kind="place")
+    point: Numbers = quantity("point of the body", "m", kind="place")
     force: Force = eqx.field(converter=adopt_force)  # pyright: ignore[reportGeneralTypeIssues]  # `point` has no default
 
     def __check_init__(self):
@@ -230,7 +230,8 @@ class AtPoint(Load):
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
-        force = self.force(t, self._build_point_particles(bodies, inertia), inertia.mass)
+        # a moment comes only where the force `sees_moments`
+        force = self.force(t, self._build_point_particles(bodies, inertia), inertia.mass)  # pyright: ignore[reportArgumentType]
         return Wrench(force, cross(to_world_frame(bodies, self.point), force))
 
     def _build_point_particles(self, bodies: RigidBodies, inertia: Inertia) -> Particles:

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.backend import any_lane
-from physjax.checks import concrete_or_none, demand_start_outside, quantity
+from physjax.checks import Numbers, concrete_or_none, demand_start_outside, quantity
 from physjax.parts import Contact
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.rigid.inertia import Inertia
@@ -43,8 +43,8 @@ class Balls(Contact):
     """
 
     couples: ClassVar[bool] = True
-    radius: Float[Array, "..."] = quantity("radius", "m", above=0)
-    restitution: Float[Array, "..."] = quantity("restitution K_r", "1", at_least=0, at_most=1, default=1.0)
+    radius: Numbers = quantity("radius", "m", above=0)
+    restitution: Numbers = quantity("restitution K_r", "1", at_least=0, at_most=1, default=1.0)
     coulomb: Coulomb | None = None
 
     def demand_fit(self, state: object, mass: object) -> None:

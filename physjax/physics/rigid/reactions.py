@@ -37,8 +37,8 @@ def solve_reactions(scene: Scene, on: Array, t: Time, h: Array) -> Thrust:
 
     def solve():
         start, state = _solve_resting_impulses(scene, scene.state, on, t, h / 2)[0], scene.state
-        given = start.momentum - state.momentum, start.angular_momentum - state.angular_momentum
-        return tuple(scale(2 / h, part) for part in given)
+        push, turn = start.momentum - state.momentum, start.angular_momentum - state.angular_momentum
+        return scale(2 / h, push), scale(2 / h, turn)
 
     return materialise_where(on, solve)
 

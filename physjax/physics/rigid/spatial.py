@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.backend import materialise
-from physjax.checks import as_real_array, as_real_quantity
+from physjax.checks import NestedArrayLike, Vectors, as_real_array, as_real_quantity
 from physjax.loops import Time, time_for_part
 from physjax.particles import Particles, check_load_shape, sum_terms
 from physjax.parts import Force, Function
@@ -47,6 +47,10 @@ class Wrench(NamedTuple):
 
     force: Float[Array, "*lanes 3"] | None = None
     torque: Float[Array, "*lanes 3"] | None = None
+
+
+WholeWrench = tuple[Array, Array]
+"""A `Wrench` with both parts present, as the sum of loads is."""
 
 
 class Load(Force):
@@ -101,10 +105,10 @@ class RigidBodies(NamedTuple):
         (True, [12.0, 0.0, 0.0], [0.0, 0.0, 10.0])
     """
 
-    position: Float[Array, "*lanes 3"]
-    orientation: Float[Array, "*lanes 4"]
-    momentum: Float[Array, "*lanes 3"]
-    angular_momentum: Float[Array, "*lanes 3"]
+    position: Vectors
+    orientation: Vectors
+    momentum: Vectors
+    angular_momentum: Vectors
 
     @property
     def lanes(self) -> tuple[int, ...]:
@@ -146,17 +150,17 @@ class RigidBodies(NamedTuple):
         present = ([part for part in parts if part is not None] for parts in kinds)
         return Wrench(*(sum_terms(parts) if parts else jnp.zeros_like(self.position) for parts in present))
 
-    def generalised_force(self, scene: Any, t: Time) -> Wrench:
-        """Total force and torque; none on bodies that are held."""
+    def generalised_force(self, scene: Any, t: Time) -> WholeWrench:
+        """Total force and torque, a `Wrench` with both; none on bodies that are held."""
         total = loads(scene, t, self.on_pivot(scene.mass))
         if scene.held is None:
             return total
         free = 1 - scene.held.astype(self.dtype)
-        return Wrench(*(scale(free, part) for part in total))
+        return Wrench(*(scale(free, part) for part in total))  # pyright: ignore[reportReturnType]  # with both parts
 
     # motion
 
-    def rate(self, wrench: Wrench, inertia: Inertia) -> "RigidBodies":
+    def rate(self, wrench: WholeWrench, inertia: Inertia) -> "RigidBodies":
         """Time derivative: x' = p/m, q' = ½(0, ω)q, p' = F, L' = τ; on a pivot what follows from turning about it."""
         force, torque = wrench
         turning = _orientation_rate(self, inertia)
@@ -254,7 +258,7 @@ class RigidBodies(NamedTuple):
 # rotation
 
 
-def to_world_frame(bodies: RigidBodies, vector: ArrayLike) -> Float[Array, "*lanes 3"]:
+def to_world_frame(bodies: RigidBodies, vector: NestedArrayLike) -> Float[Array, "*lanes 3"]:
     """A vector of the body frame, one for all bodies or one per lane, in the world frame: R v."""
     return rotate_vector(bodies.orientation, broadcast_vector(jnp.asarray(vector, bodies.dtype), bodies.position))
 

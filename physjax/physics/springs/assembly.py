@@ -54,6 +54,7 @@ class Lattice(NamedTuple):
 SpringKind = tuple[np.ndarray, NestedArrayLike | None]
 """Pairs of nodes, and the stiffness of the springs between them [N/m]; None: there are none."""
 NO_FACES = np.zeros((0, 3), int)
+"""The faces of what has none: a rope, a truss."""
 
 
 def build_lattice(

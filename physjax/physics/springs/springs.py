@@ -160,6 +160,8 @@ class Springs(Force):
         if self.limit is None:
             return self, state
         self._demand_nodes(state)
+        assert self.limit is not None  # `advance` is there only where springs can break
+        assert self.intact is not None
         held = []
         for slot, d in enumerate(self.topology.parts(state.position)[0]):
             L, limit = self._take_slot(slot, self.L, d), self._take_slot(slot, self.limit, d)

@@ -115,7 +115,11 @@ def forget_contacts(part: Part) -> Part:
 
 
 def _reduce_number(
-    i: int, numbers: list[Number], structure: jax.tree_util.PyTreeDef, part: Force | Contact, plane: _Plane
+    i: int,
+    numbers: list[Number],
+    structure: jax.tree_util.PyTreeDef,  # pyright: ignore[reportInvalidTypeForm]  # no stub
+    part: Force | Contact,
+    plane: _Plane,
 ) -> Array:
     """A number of a part in the plane, by its declared kind."""
     number, axis, owner = numbers[i], plane.axis, callable_name(part)
@@ -144,7 +148,12 @@ def _reduce_number(
     return rest
 
 
-def _depends_across(i: int, numbers: list[Number], structure: jax.tree_util.PyTreeDef, plane: _Plane) -> bool:
+def _depends_across(
+    i: int,
+    numbers: list[Number],
+    structure: jax.tree_util.PyTreeDef,  # pyright: ignore[reportInvalidTypeForm]  # no stub
+    plane: _Plane,
+) -> bool:
     """Whether moving a place of a part across the plane changes what the part does: of a floor its point may be anywhere."""
     values = [jnp.asarray(number.value) for number in numbers]
     across = jnp.zeros_like(values[i]).at[..., plane.axis].set(1.0)

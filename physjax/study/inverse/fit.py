@@ -82,10 +82,8 @@ def fit(
         return jnp.where(present, found - jnp.where(present, data, 0.0), 0.0) * weight
 
     z, _, converged, steps = solve(residual, jnp.zeros_like(start), max_steps=max_steps)
-    left, jacobian = _linearise(residual, z)
+    left, covariance, known = _estimate_errors(residual, z, present, unit, sigma is not None)
     spare = jnp.sum(present) - start.size
-    variance = jnp.ones((), data.dtype) if sigma is not None else jnp.sum(left * left) / spare.astype(data.dtype)
-    covariance, known = _covariance(jacobian, variance, unit)
     value = start + unit * z
     return Fit(
         unravel(value),
@@ -95,6 +93,19 @@ def fit(
         steps,
         covariance,
     )
+
+
+def _estimate_errors(
+    residual: Callable[[Array], Array], z: Array, present: Array, unit: Array, weighted: bool
+) -> tuple[Array, Array, Array]:
+    """The residual at the solution, the covariance of the numbers, and whether the data determine them.
+
+    Without a sigma given the variance of the data is that of the residuals, over the degrees of freedom that are left.
+    """
+    left, jacobian = _linearise(residual, z)
+    spare = jnp.sum(present) - z.size
+    variance = jnp.ones((), left.dtype) if weighted else jnp.sum(left * left) / spare.astype(left.dtype)
+    return left, *_covariance(jacobian, variance, unit)
 
 
 def _linearise(residual: Callable[[Array], Array], z: Array) -> tuple[Array, Array]:

@@ -130,7 +130,7 @@ def choose_layout(
     program: LaneProgram,
     lanes: int,
     memory: int,
-    devices: Sequence[jax.Device],
+    devices: Sequence[jax.Device],  # pyright: ignore[reportInvalidTypeForm]  # no stub
     batch: int | None = None,
     begun: tuple[int, int] | None = None,
 ) -> Layout:
@@ -160,7 +160,11 @@ def choose_layout(
 
 
 @functools.lru_cache(maxsize=16)
-def compile_batch(program: LaneProgram, cut: Layout, devices: tuple[jax.Device, ...]) -> Callable[..., Sequence[Array]]:
+def compile_batch(
+    program: LaneProgram,
+    cut: Layout,
+    devices: tuple[jax.Device, ...],  # pyright: ignore[reportInvalidTypeForm]  # no stub
+) -> Callable[..., Sequence[Array]]:
     """The batch as one executable: leaves `(count, size, ...)` of points to those of values, and status."""
     one = jax.vmap(jaxpr_as_fun(program.jaxpr))
 

@@ -54,7 +54,7 @@ def sweep(
     memory: int = BATCH_MEMORY_BYTES,
     out: str | os.PathLike | None = None,
     progress: bool = True,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]  # no stub
     shard: tuple[int, int] | None = None,
 ) -> Sweep:
     """`measure(**point)` at every point of the axes: named arrays, crossed ("grid") or zipped ("zip").
@@ -116,7 +116,7 @@ def _compute_chunks(
     lanes: Lanes,
     program: LaneProgram,
     cut: Layout,
-    devices: tuple[jax.Device, ...],
+    devices: tuple[jax.Device, ...],  # pyright: ignore[reportInvalidTypeForm]  # no stub
     shard: tuple[int, int],
     progress: bool,
 ) -> None:
@@ -167,7 +167,9 @@ def _build_abstract_point(lanes: Lanes) -> dict[str, PyTree]:
     return {axis.name: jax.tree.map(one, axis.values) for axis in lanes.axes}
 
 
-def _check_devices(devices: Sequence[jax.Device] | None) -> tuple[jax.Device, ...]:
+def _check_devices(
+    devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]  # no stub
+) -> tuple[jax.Device, ...]:  # pyright: ignore[reportInvalidTypeForm]  # no stub
     devices = tuple(jax.local_devices() if devices is None else devices)
     if not devices or not all(device in jax.local_devices() for device in devices):
         raise ValueError(f"devices: got {devices}, expected some of jax.local_devices(): {jax.local_devices()}.")
