@@ -121,10 +121,6 @@ def _build_limbs() -> tuple[inertia.Inertia, np.ndarray, np.ndarray, np.ndarray,
     middle = np.stack([x, np.full_like(x, height), z], axis=-1)
     pairs = np.array([[names.index(name) for name in pair] for *pair, _, _ in JOINT_PLACES])
     where = np.array([[x, height, z] for *_, x, z in JOINT_PLACES])
-    return (
-        mass,
-        radius,
-        length,
-        middle,
-        rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0),
-    )
+    joints = rigid.Joints(pairs, where[:, None] - middle[pairs], stiffness=1e6, damping=300.0)
+    moments = [inertia.capsule(*limb, axis=0).principal for limb in zip(mass, radius, length, strict=True)]
+    return inertia.Inertia(mass, jnp.stack(moments)), radius, length, middle, joints
