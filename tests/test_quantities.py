@@ -108,7 +108,7 @@ def test_a_number_along_one_axis_of_the_lanes_must_say_which(name, unannotated):
     ],
 )
 def test_gravity_as_other_engines_take_it_is_refused_with_the_right_call(given, call, unannotated):
-    with pytest.raises(ValueError, match=rf"^g .*expected a number >= 0: gravity points down by itself.*{call}"):
+    with pytest.raises(ValueError, match=rf"^g .*expected a number >= 0: gravity points down the axis.*{call}"):
         forces.Gravity(given)
 
 

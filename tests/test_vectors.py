@@ -1,11 +1,15 @@
 """The vector helpers equal NumPy at any number of lanes, and their derivatives are right, also where the formulas are not."""
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from physjax.vectors import (
+    add_leading_axes,
+    add_trailing_axes,
     axis_vector,
     broadcast_vector,
     components,
@@ -58,6 +62,8 @@ def everything(a, b, flat, number, vector, amount):
         "broadcast_vector": broadcast_vector(vector, a),
         "axis_vector": axis_vector(number, 2, a),
         "axis_vector, one number": axis_vector(amount, 1, flat),
+        "add_trailing_axes": add_trailing_axes(number, 3),
+        "add_leading_axes": add_leading_axes(number, 2),
     }
 
 
@@ -98,13 +104,16 @@ def expected(a, b, flat, number, vector, amount):
         "broadcast_vector": (np.broadcast_to(vector, a.shape), 0.0),
         "axis_vector": (axis, 0.0),
         "axis_vector, one number": (np.broadcast_to([0.0, amount], flat.shape), 0.0),
+        "add_trailing_axes": (number[:, None, None], 0.0),
+        "add_leading_axes": (number[None, :], 0.0),
     }
 
 
 def test_the_table_of_expected_values_misses_no_helper():
     import physjax.vectors as module
 
-    public = {name for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
+    ours = {name: f for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
+    public = {name for name, f in ours.items() if not isinstance(f, TypeVar)}
     named = {word.strip(",") for name in expected(*some(2, np.float64)) for word in name.split()[:1]}
     assert {name for name in public if not name.startswith("_")} == named
 
