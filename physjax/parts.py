@@ -85,8 +85,8 @@ class Force(eqx.Module):
         serve_old_names(cls, FORCE_OLD_NAMES)
 
     @abstractmethod
-    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        """Force on each lane [N]."""
+    def __call__(self, t: ArrayLike, state: PyTree, mass: PyTree) -> PyTree:
+        """Force on each lane [N], shaped like the velocity; of a load on rigid bodies the wrench."""
 
     def potential(self, t: ArrayLike, state: PyTree, mass: PyTree) -> Array | None:
         """Potential energy [J], shaped like the lanes (a shared energy is halved between its two lanes); None without one."""
@@ -194,7 +194,7 @@ class Contact(eqx.Module):
         """Signed distance to the surface [m], > 0 on the legal side."""
 
     @abstractmethod
-    def respond(self, t: ArrayLike, state: Particles) -> Particles:
+    def respond(self, t: ArrayLike, state: PyTree) -> PyTree:
         """The state after contact; lanes that are not in contact stay as they are."""
 
     def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> Sequence[np.ndarray] | None:

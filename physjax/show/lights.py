@@ -44,7 +44,7 @@ def darken_background(ax: "Axes", flat: bool) -> None:
         return
     for axis in get_space_axes(cast("Axes3D", ax)):
         axis.set_pane_color((*NIGHT_COLOUR, 1.0))
-        axis._axinfo["grid"].update(color="0.3", linewidth=0.5)
+        axis._axinfo["grid"].update(color="0.3", linewidth=0.5)  # pyright: ignore[reportAttributeAccessIssue]  # not of the public face
 
 
 def render_glow(points: np.ndarray, wide: np.ndarray, light: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -97,7 +97,7 @@ def _style_space_axes(ax: "Axes3D", stage: Stage, up: int) -> None:
     for axis in get_space_axes(ax):
         axis.set_pane_color((0.98, 0.98, 0.985, 1.0))
         axis.line.set_color("0.75")
-        axis._axinfo["grid"].update(color="0.9", linewidth=0.6)
+        axis._axinfo["grid"].update(color="0.9", linewidth=0.6)  # pyright: ignore[reportAttributeAccessIssue]  # not of the public face
     ax.tick_params(pad=0)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.labelpad = 2

@@ -301,7 +301,7 @@ def _count_steps(scene: Scene, method: Adaptive, dt: Array, steps: int) -> Steps
     dt = dt.astype(scene.state.dtype)
     arrays, still = eqx.partition(scene, eqx.is_array)
 
-    def one(arrays, i):
+    def one(arrays: Scene, i: Array) -> tuple[Scene, Steps]:
         scene = eqx.combine(arrays, still)
         t = moment_at(i, dt, scene.state.dtype)
         reported = method.report(scene, t, scene.state, dt)

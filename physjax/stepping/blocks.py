@@ -11,17 +11,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import PyTree
 
 from physjax.backend import count_lane_blocks
 from physjax.scene import Scene
 
 
 class Blocks(NamedTuple):
-    """How the lanes of a scene are cut: `count` blocks of `size`, the last padded with copies of the first lanes."""
+    """How the lanes of a scene are cut: `number` blocks of `size`, the last padded with copies of the first lanes."""
 
     lanes: tuple[int, ...]
     size: int
-    count: int
+    number: int
 
     @classmethod
     def of(cls, scene: Scene, moving: Any, frame_steps: int) -> "Blocks | None":
@@ -38,7 +39,7 @@ class Blocks(NamedTuple):
         return blocks if all(jax.tree.leaves(scene.build_lane_mask(moving))) else None
 
     def cut(self, tree: Any) -> Any:
-        """Trees of per-lane arrays as `(count, size, ...)`."""
+        """Trees of per-lane arrays as `(number, size, ...)`."""
         return jax.tree.map(self._cut_leaf, tree)
 
     def join(self, tree: Any, leading: int = 0) -> Any:
@@ -53,7 +54,7 @@ class Blocks(NamedTuple):
         cut = lambda leaf, has_lanes: self._cut_leaf(leaf) if has_lanes else None  # noqa: E731
         parts = [jax.tree.map(cut, other, mask) for other, mask in zip(others, masks, strict=True)]
 
-        def one(slices):
+        def one(slices: tuple[PyTree, ...]) -> PyTree:
             block, *lanes = slices
             whole = [
                 jax.tree.map(
@@ -68,11 +69,11 @@ class Blocks(NamedTuple):
     def _cut_leaf(self, leaf: Any) -> Any:
         n = len(self.lanes)
         flat = leaf.reshape((-1, *leaf.shape[n:]))
-        filled = jnp.concatenate([flat, flat[: self.count * self.size - flat.shape[0]]])
-        return filled.reshape((self.count, self.size, *leaf.shape[n:]))
+        filled = jnp.concatenate([flat, flat[: self.number * self.size - flat.shape[0]]])
+        return filled.reshape((self.number, self.size, *leaf.shape[n:]))
 
     def _join_leaf(self, leaf: Any, leading: int) -> Any:
         front, rest = leaf.shape[:leading], leaf.shape[leading + 2 :]
-        flat = leaf.reshape((*front, self.count * self.size, *rest))
+        flat = leaf.reshape((*front, self.number * self.size, *rest))
         total = math.prod(self.lanes)
         return flat[(slice(None),) * leading + (slice(total),)].reshape((*front, *self.lanes, *rest))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from physjax.backend import any_lane
 from physjax.linear import MAX_CRAMER_UNKNOWNS, solve_columns
@@ -71,18 +71,19 @@ class ImplicitEuler(eqx.Module):
                 raise ValueError(f"ImplicitEuler: got {name}={value!r}, expected an integer of at least {least}.")
 
     @property
-    def __name__(self) -> str:
+    def __name__(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]  # of the instance, as a function has
         return "implicit_euler" if not self.newton else "implicit_euler, converged"
 
     def __call__(self, system: System, t: Time, state: S, dt: ArrayLike) -> S:
         """The state after a step dt [s] from the time t [s]."""
-        return self._take_step(system, t, state, dt)[0]
+        return self.solve_step(system, t, state, dt)[0]
 
     def report(self, scene: Scene, dt: ArrayLike, t: ArrayLike = 0.0) -> SolveReport:
         """How the step from `scene.state` is solved: relative residual, products with the matrix, ok; for each scene."""
         return _report_step(self, scene, jnp.asarray(t, scene.state.dtype), jnp.asarray(dt, scene.state.dtype))
 
-    def _take_step(self, system: System, t: Time, state: S, dt: ArrayLike) -> tuple[S, SolveReport]:
+    def solve_step(self, system: System, t: Time, state: S, dt: ArrayLike) -> tuple[S, SolveReport]:
+        """The state after a step dt [s] from the time t [s], and how it was solved."""
         step = _Step.of(system, t, state, dt)
         if self.newton:
             guess, _ = self._solve_linearised(step, LARGEST_FORCING_TERM)
@@ -106,13 +107,13 @@ class ImplicitEuler(eqx.Module):
     def _solve_converged(self, step: "_Step", guess: Vector) -> tuple[Vector, SolveReport]:
         """u from the full equation, by Newton's method from a guess; its derivative by the implicit function theorem."""
 
-        def residual(u):
+        def residual(u: Vector) -> Vector:
             return _subtract(u, step.kick(step.system.rate(step.end, step.end_state(u))))
 
-        def tangent(g, y):
+        def tangent(g: Callable[[Vector], Vector], y: Vector) -> Vector:
             return self._solve_linear(step, g, y, self._limit_tolerance(y), False)[0]
 
-        def solve(f, u):
+        def solve(f: Callable[[Vector], Vector], u: Vector) -> tuple[Vector, list[Array]]:
             u, reported = self._iterate_newton(step, f, u)
             # as floats: jax 0.10 differentiates what comes along, and numbers that count have no derivative
             return u, [leaf.astype(u[0].dtype) for leaf in reported]
@@ -125,7 +126,7 @@ class ImplicitEuler(eqx.Module):
         size = step.inner(zero, zero)
         goal = self._limit_tolerance(u) ** 2 * size
 
-        def body(carry):
+        def body(carry: tuple[Vector, Array, Array, Array, Array]) -> tuple[Vector, Array, Array, Array, Array]:
             u, square, going, count, i = carry
             r, tangent = jax.linearize(residual, u)
             # solving for more digits than Newton's method still misses would be wasted
@@ -159,10 +160,11 @@ class ImplicitEuler(eqx.Module):
             return [u], build_report(step.inner(r, r), size, tolerance**2 * size, products)
         iterate = conjugate_gradients if dissipative_symmetric else stabilised_biconjugate_gradients
 
-        def solve(matvec, b):
+        def solve(matvec: Callable[[Vector], Vector], b: Vector) -> tuple[Vector, SolveReport]:
             return iterate(matvec, b, step.inner, tolerance, self.iterations)
 
-        def transposed(matvec, b):  # self-adjoint with the masses' inverse where the matrix is with the masses
+        def transposed(matvec: Callable[[Vector], Vector], b: Vector) -> tuple[Vector, SolveReport]:
+            # self-adjoint with the masses' inverse where the matrix is with the masses
             return iterate(matvec, b, step.inner_of_dual, tolerance, self.iterations)
 
         return lax.custom_linear_solve(matvec, b, solve, transposed, has_aux=True)
@@ -181,7 +183,7 @@ class _Step(NamedTuple):
     def of(cls, system: System, t: Time, state: PyTree, dt: ArrayLike) -> "_Step":
         kicked_leaves = []
 
-        def kick(state):
+        def kick(state: PyTree) -> PyTree:
             after = system.kick(state, state, dt)
             pairs = zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True)
             kicked_leaves.extend(before is not now for before, now in pairs)
@@ -261,12 +263,12 @@ def _search_line(
 ) -> tuple[Vector, jax.Array]:
     """u - change, each system's change halved until its residual falls, left out where that does not help."""
 
-    def tried(share):
+    def tried(share: Array) -> Array:
         new = [a - scale(share, b) for a, b in zip(u, change, strict=True)]
         r = residual(new)
         return step.inner(r, r)
 
-    def halve(carry):
+    def halve(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         share, found, i = carry
         share = jnp.where(found < square, share, share / 2)
         return share, tried(share), i + 1
@@ -291,4 +293,4 @@ def _solve_per_lane(matvec: Callable, b: jax.Array) -> jax.Array:
 
 @jax.jit
 def _report_step(method: ImplicitEuler, scene: Scene, t: jax.Array, dt: jax.Array) -> SolveReport:
-    return method._take_step(scene.averaged_over_step(t, dt), t, scene.state, dt)[1]
+    return method.solve_step(scene.averaged_over_step(t, dt), t, scene.state, dt)[1]

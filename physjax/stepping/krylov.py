@@ -29,6 +29,11 @@ class SolveReport(NamedTuple):
     ok: Bool[Array, "..."]
 
 
+_ConjugateCarry = tuple[Vector, Vector, Vector, Array, Array, Array, Array, Array]
+_BiconjugateCarry = tuple[Vector, Vector, Vector, Array, Array, Array, Array, Array, Array]
+"""What an iteration hands on: three vectors and numbers for each system, of which the last counts products."""
+
+
 def conjugate_gradients(
     matvec: Callable[[Vector], Vector], b: Vector, inner: Callable, tolerance: ArrayLike, most: int
 ) -> tuple[Vector, SolveReport]:
@@ -39,7 +44,7 @@ def conjugate_gradients(
     size = inner(b, b)
     goal = tolerance**2 * size
 
-    def body(carry):
+    def body(carry: _ConjugateCarry) -> _ConjugateCarry:
         x, r, p, square, going, count, looks, i = carry
         q = matvec(p)
         curvature = inner(p, q)
@@ -67,7 +72,7 @@ def stabilised_biconjugate_gradients(
     size = inner(b, b)
     goal = tolerance**2 * size
 
-    def body(carry):
+    def body(carry: _BiconjugateCarry) -> _BiconjugateCarry:
         x, r, p, rho, square, going, count, looks, i = carry
         v = matvec(p)
         alpha = _safe_ratio(rho, inner(b, v), going)

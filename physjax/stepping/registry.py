@@ -44,9 +44,9 @@ def promises(
     """
 
     def attach(method: Callable) -> Callable:
-        method.promises = Promises(
-            order, evaluations, stability_limit, order if order_with_drag is None else order_with_drag
-        )
+        with_drag = order if order_with_drag is None else order_with_drag
+        promised = Promises(order, evaluations, stability_limit, with_drag)
+        method.promises = promised  # pyright: ignore[reportFunctionMemberAccess]  # a function may carry attributes
         METHODS[method.__name__] = method
         return method
 

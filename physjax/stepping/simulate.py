@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.backend import MIN_LANES_TO_SELECT, jit_untransformed, split_compilation
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
@@ -82,18 +82,26 @@ def simulate(
     return run(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
-def _run_steps(scene, method, dt, first_step, frames, save_every, record):
+def _run_steps(
+    scene: Scene,
+    method: Callable,
+    dt: Array,
+    first_step: Array,
+    frames: int,
+    save_every: int,
+    record: Callable | None,
+) -> Trajectory:
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
     changing = scene.changing()
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
 
-    def step(i, moving, still, dt):
+    def step(i: Array, moving: PyTree, still: PyTree, dt: Array) -> PyTree:
         return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
 
     blocks = Blocks.of(scene, moving, frame_steps=save_every) if record is None else None
 
-    def frame(moving, index):
+    def frame(moving: PyTree, index: Array) -> tuple[PyTree, PyTree]:
         first = first_step + index * save_every
         if blocks is None:
             moving = repeat_steps(partial(step, still=still, dt=dt), moving, first, save_every)
@@ -179,11 +187,11 @@ def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame
     changing = scene.changing()
     moving, still = eqx.partition(scene, changing)
 
-    def step(i, moving):
+    def step(i: ArrayLike, moving: PyTree) -> PyTree:
         i = jnp.asarray(i, jnp.int32)  # a plain number where jit is disabled
         return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
 
-    def frame(moving, index):
+    def frame(moving: PyTree, index: Array) -> tuple[PyTree, PyTree]:
         moving = lax.fori_loop(index * steps_per_frame, (index + 1) * steps_per_frame, step, moving)
         return moving, eqx.combine(moving, still).state
 

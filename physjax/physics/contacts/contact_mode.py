@@ -175,6 +175,10 @@ def _build_contact_state(
     )
 
 
+_Forces = tuple[list[Array], list[Array], list[list[Array]]]
+"""The acceleration left over, and the normal force and the friction of each surface; vectors are lists of components."""
+
+
 def _solve_contact_forces(contacts: list[_ContactState], acceleration: list[Array]) -> tuple[list[Array], list[Array]]:
     """The acceleration left over under normal forces and static friction, and the normal forces.
 
@@ -182,7 +186,7 @@ def _solve_contact_forces(contacts: list[_ContactState], acceleration: list[Arra
     and the friction what keeps a still lane in place, cut to Coulomb's cone.
     """
 
-    def sweep(forces):
+    def sweep(forces: _Forces) -> _Forces:
         total, normal_force, friction = forces
         normal_force, friction = list(normal_force), list(friction)
         for i, c in enumerate(contacts):
@@ -210,7 +214,7 @@ def _solve_contact_forces(contacts: list[_ContactState], acceleration: list[Arra
         acceleration, acceleration
     )
 
-    def repeat(carry):
+    def repeat(carry: tuple[_Forces, Array]) -> tuple[_Forces, Array]:
         before, _ = carry
         after = sweep(before)
         moved = [a - b for a, b in zip(after[0], before[0], strict=True)]

@@ -48,7 +48,7 @@ def _advance_to_surface(signed_distance: Callable[[Array], Array], far: Array, t
     """
     with_slope = lambda s: jax.jvp(signed_distance, (s,), (jnp.ones_like(s),))  # noqa: E731
 
-    def advance(carry):
+    def advance(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         s, d, slope, _ = carry
         free = jnp.maximum(d, 0.0) / far
         newton = jnp.clip(d / jnp.where(slope < 0, -slope, 1.0), free, MAX_NEWTON_STRETCH * free)
@@ -79,7 +79,7 @@ def _descend_to_lowest_point(
     s, d, slope = met
     stride = jnp.clip(touch / jnp.where(slope < 0, -slope, 1.0), 0.0, 1 / MAX_PATH_SAMPLES)
 
-    def descend(carry):
+    def descend(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         s, d, stride, _ = carry
         further = jnp.minimum(s + stride, 1.0)
         there = signed_distance(further)

@@ -57,7 +57,10 @@ class Surface(Contact):
     friction: OptionalNumbers = quantity("friction K_f", "1", at_least=0, at_most=1, default=None, kw_only=True)
     coulomb: Coulomb | None = eqx.field(default=None, kw_only=True)
     velocity: OptionalNumbers = quantity("surface velocity", "m/s", kind="vector", default=None, kw_only=True)
-    response: Callable[..., Scene] | None = eqx.field(static=True, default=None, kw_only=True)
+    # a field or a property where other contacts have a class attribute: all are read the same way
+    response: Callable[..., Scene] | None = eqx.field(  # pyright: ignore[reportIncompatibleVariableOverride]
+        static=True, default=None, kw_only=True
+    )
     touching_since: OptionalNumbers = unchecked_quantity(
         "begin of contact", "s", per="memory", default=None, kw_only=True
     )
@@ -73,7 +76,7 @@ class Surface(Contact):
             raise TypeError(f"response: got {self.response!r}, expected contacts.impact, contacts.project or None.")
 
     @property
-    def memory(self) -> tuple[str, ...]:
+    def memory(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Names of the arrays that a step changes: since when each lane is in contact, where impacts are timed."""
         return ("touching_since",) if self.response is impact else ()
 

@@ -126,7 +126,7 @@ def _step_through_contacts(
     leg = leg._replace(state=state, since=since, arrived=~meets)
 
     # a scan of fixed length and not a while loop, so that reverse mode goes through; a leg that no lane needs is a branch
-    def go_on(leg, _):
+    def go_on(leg: _StepProgress, _) -> tuple[_StepProgress, None]:
         more = any_lane(~leg.arrived)
         return lax.cond(
             more, lambda: choose_lanes(leg.arrived, leg, _advance_leg(motion, scene, leg, t, dt)), lambda: leg
@@ -200,7 +200,7 @@ def fold_flights(
     """The total of `total = add(total, flight)` over the legs of the step that `impact` takes, and the state after it."""
     leg, dt = _start_progress(scene, dt)
 
-    def fly(leg, total):
+    def fly(leg: _StepProgress, total: Total) -> tuple[_StepProgress, Total]:
         leg_start, _, start = _begin_leg(scene, leg, t, dt)
         held = apply_contact_mode(scene, _collect_walls(scene), start)
         after = choose_lanes(leg.arrived, leg, _advance_leg(motion, scene, leg, t, dt))
@@ -208,7 +208,7 @@ def fold_flights(
         end = motion(held, leg_start, duration).state
         return after, add(total, Flight(leg.state, held, leg_start, duration, end, after.state, ~leg.arrived))
 
-    def go_on(carry, _):
+    def go_on(carry: tuple[_StepProgress, Total], _) -> tuple[tuple[_StepProgress, Total], None]:
         return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
 
     (leg, total), _ = lax.scan(go_on, (leg, total), length=MAX_IMPACTS + 1)
@@ -224,7 +224,7 @@ def _find_event_time(
     """
     event, rest = lax.stop_gradient((event, rest))
 
-    def find_smallest_guard(duration, scene, start, event, leg_start):
+    def find_smallest_guard(duration: Array, scene: Scene, start: ContactMode, event: Event, leg_start: Time) -> Array:
         state, walls = motion(scene, leg_start, duration).state, _collect_walls(scene)
         faces = collect_faces(walls, to_float_time(leg_start), start.state)
         return jnp.min(

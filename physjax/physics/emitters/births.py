@@ -14,7 +14,9 @@ from jaxtyping import Array, Float, UInt32
 from physjax.loops import force_rounding
 
 if TYPE_CHECKING:
-    from physjax.checks import Numbers as Key  # a seed or a key is given, words are read
+    from physjax.checks import Numbers
+
+    Key = Numbers  # a seed or a key is given, words are read
 else:
     Key = UInt32[Array, "words"]
 

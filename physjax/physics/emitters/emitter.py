@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.backend import compact_and_apply_runs, materialise
 from physjax.checks import (
@@ -109,7 +109,7 @@ class Emitter(ParticleSource):
         # an array, not a count: selected lanes keep the numbers of their slots
         self.slot = jnp.arange(self.pool, dtype=jnp.int32)
         self.start_rest = float32_remainder(self.start, self.start_rest)
-        if self.generation is None:  # given where `dataclasses.replace` changes a number during a run
+        if self.generation is None:  # pyright: ignore[reportUnnecessaryComparison]  # given where `dataclasses.replace` changes a number during a run
             memory = _begin_memory(self.slot.size, jnp.result_type(float))
             self.generation, self.born, self.born_rest, self.dies, self.dies_rest = memory
 
@@ -297,10 +297,10 @@ class Emitter(ParticleSource):
         """The emitter and the state after all births by the time t [s]; random numbers are drawn for those lanes only."""
         due_generation = jnp.maximum(self.due_generation(t), self.generation)
 
-        def is_due(changing, slot, due_generation):
+        def is_due(changing: tuple[PyTree, ...], slot: Array, due_generation: Array) -> Array:
             return due_generation > changing[1]
 
-        def give_birth(changing, slot, due_generation):
+        def give_birth(changing: tuple[PyTree, ...], slot: Array, due_generation: Array) -> tuple[PyTree, ...]:
             (x, v), generation, *times = changing
             new, birth = due_generation > generation, self.births(slot, due_generation)
             state = Particles(_choose_vectors(new, birth.position, x), _choose_vectors(new, birth.velocity, v))

@@ -33,7 +33,7 @@ class Flow(Force):
         [2. 2.]
     """
 
-    coefficient: eqx.AbstractVar[Float[Array, "..."]]
+    coefficient: eqx.AbstractVar[Numbers]
 
     @abstractmethod
     def flow(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:

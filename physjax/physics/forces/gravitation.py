@@ -42,7 +42,7 @@ class Gravitation(Field):
         x, gm = state.position, self._gm(state, mass)
         targets = _split_components(x)
 
-        def pull(total, sources, strength):
+        def pull(total: list[Array], sources: list[Array], strength: Array) -> list[Array]:
             offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
             near = self._inverse_distance(offsets)
             weight = strength[..., None, :] * near * near * near  # in this order float32 reaches Pluto in SI units
@@ -55,7 +55,7 @@ class Gravitation(Field):
         x, gm = state.position, self._gm(state, mass)
         targets = _split_components(x)
 
-        def add(total, sources, strength):
+        def add(total: Array, sources: list[Array], strength: Array) -> Array:
             offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
             return total + jnp.sum(strength[..., None, :] * self._inverse_distance(offsets), axis=-1)
 
@@ -94,7 +94,7 @@ def _fold_tiles(
         return add(total, sources, strength)
     missing = -count % SOURCES_PER_TILE
 
-    def tiles(a):
+    def tiles(a: Array) -> Array:
         filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)])
         return jnp.moveaxis(filled.reshape((*a.shape[:-1], -1, SOURCES_PER_TILE)), -2, 0)
 

@@ -168,7 +168,7 @@ class Control(Force):
         t, knots = self._align_time_and_knots(to_float_time(t), state)
         lasts = (knots[..., 0] <= t) & (t < knots[..., -1])
         if self.linear:
-            return scale(lasts.astype(t.dtype), self._interpolate(t, state))
+            return scale(lasts.astype(t.dtype), self.interpolate(t, state))
         here = (knots[..., :-1] <= t[..., None]) & (t[..., None] < knots[..., 1:])
         return self._weighted_sum(here.astype(t.dtype), state)
 
@@ -200,7 +200,7 @@ class Control(Force):
         t, at, duration = jnp.broadcast_arrays(align_with_lanes(t, state), self.at, self.duration)
         return t, self._knot_times(at, duration)
 
-    def _interpolate(self, t: Time, state: Particles) -> Array:
+    def interpolate(self, t: Time, state: Particles) -> Array:
         """The value at a time on the straight lines between the knots, constant beyond the first and the last."""
         ahead = align_moment(t, 1.0, state)[0].time_until(self.at, cast_remainder(self.at, self.at_rest))
         ahead, duration = jnp.broadcast_arrays(ahead, self.duration)
@@ -227,7 +227,7 @@ class _LinearControlStep(Force):
     share: Numbers = unchecked_quantity("share of the step", per="memory")
 
     def __call__(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
-        return scale(self.share, self.control._interpolate(t, state))
+        return scale(self.share, self.control.interpolate(t, state))
 
 
 __all__ = ["Blast", "Constant", "Control", "Kick"]

@@ -131,7 +131,7 @@ class Buoyancy(Force):
         """ρ_f V g along the upward axis [N]."""
         return axis_vector(self.density * self._g * self.displaced_volume(state), self._up, state.velocity)
 
-    def under(self, weight: tuple[Array | np.ndarray | None, int]) -> "Buoyancy":
+    def under(self, weight: tuple[ArrayLike | None, int]) -> "Buoyancy":
         """The buoyancy with g and the upward axis of the scene's gravity; ValueError where it was given others."""
         g, up = weight
         given, scene = (None if a is None else concrete_or_none(a) for a in (self.g, g))

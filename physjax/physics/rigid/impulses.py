@@ -159,21 +159,21 @@ def _solve_fixed_point(rows: _PointRows, body: _Body, start: Array) -> Array:
     sweeps as well, so that nothing is differentiated through the sweeps themselves.
     """
 
-    def residual(j):
+    def residual(j: Array) -> Array:
         return _sweep_points(rows, body, j)[0] - j
 
-    def repeat_sweeps(_, j):
+    def repeat_sweeps(_, j: Array) -> Array:
         # the velocity of the body is carried along, so that a point's turn costs no sum over the other points
         moved = _sum_body_changes(rows, body, j)
 
-        def pass_(carry):
+        def pass_(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             after, moved = _sweep_points(rows, body, carry[0], carry[1])
             return after, moved, _find_changed_lanes(carry[0], after)
 
         return _repeat_until_settled(pass_, (j, moved, jnp.any(rows.share > 0, axis=0)))[0]
 
-    def solve_linear(change, right):
-        def pass_(carry):
+    def solve_linear(change: Callable[[Array], Array], right: Array) -> Array:
+        def pass_(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             after = carry[0] + change(carry[0]) - right
             return after, _find_changed_lanes(carry[0], after)
 

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import Numbers, as_real_quantity, quantity, unchecked_quantity
+from physjax.loops import Time
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity, to_world_frame
 from physjax.vectors import cross, dot, norm, scale
@@ -55,7 +56,7 @@ class Joints(Load):
         self.stiffness = as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
 
-    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """Forces and torques on all bodies, with equal and opposite forces at each joint."""
         arms, apart = self._locate_arms(bodies)
         straight = self._take_ends(scale(1 / inertia.mass, bodies.momentum))
@@ -66,12 +67,12 @@ class Joints(Load):
         torques = jnp.concatenate([cross(arms[0], pull), cross(arms[1], -pull)], axis=-2)
         return Wrench(self._sum_by_body(forces, bodies), self._sum_by_body(torques, bodies))
 
-    def potential(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes"]:
+    def potential(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> Float[Array, "*lanes"]:
         """½k d² [J], halved between the two bodies."""
-        _, apart = self._locate_arms(bodies)
+        _, apart = self._locate_arms(state)
         half = 0.25 * self.stiffness * dot(apart, apart)
         shares = jnp.concatenate([half, half], axis=-1)[..., None]
-        return self._sum_by_body(shares, bodies)[..., 0]
+        return self._sum_by_body(shares, state)[..., 0]
 
     def error(self, bodies: RigidBodies) -> Float[Array, "*scenes joints"]:
         """How far the two points of each joint are apart [m]."""

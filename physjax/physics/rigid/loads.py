@@ -133,7 +133,7 @@ class Torque(Load):
     def __check_init__(self):
         _demand_frame(self.frame)
 
-    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The torque, and no force."""
         world = self.frame == "world"
         return Wrench(
@@ -152,7 +152,7 @@ class RotationalDrag(Load):
 
     coefficient: Numbers = quantity("drag coefficient c", "N m s", at_least=0)
 
-    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The torque, and no force."""
         return Wrench(torque=scale(-self.coefficient, angular_velocity(bodies, inertia)))
 
@@ -169,7 +169,7 @@ class Thrust(Load):
     force: Numbers = quantity("thrust", "N", kind="vector")
     point: Numbers = quantity("point of the body", "m", kind="place", default=(0.0, 0.0, 0.0))
 
-    def wrench(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
         force = to_world_frame(bodies, self.force)
         return Wrench(force, cross(to_world_frame(bodies, self.point), force))
@@ -195,13 +195,15 @@ class AtPoint(Load):
         if isinstance(self.force, Load) or self.force.remembers:
             raise TypeError(f"AtPoint: got {type(self.force).__name__}, expected a force on particles that forgets.")
 
+    # a class attribute of other forces, a property of this one: both are read the same way
+
     @property
-    def couples(self) -> bool:
+    def couples(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the force ties bodies together."""
         return self.force.couples
 
     @property
-    def sees_moments(self) -> bool:
+    def sees_moments(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the force asks for the time as a moment."""
         return self.force.sees_moments
 

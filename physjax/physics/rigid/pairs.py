@@ -74,14 +74,14 @@ class Balls(Contact):
     def resolve(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> RigidBodies:
         """The balls after all collisions of a step."""
 
-        def sweep(state):
+        def sweep(state: RigidBodies) -> RigidBodies:
             after, _ = lax.scan(
                 lambda state, pair: (self._resolve_pair(state, mass, pair), None), state, self._build_pair_masks(state)
             )
             return after
 
         # a scan of fixed length and not a while loop, so that reverse mode goes through; idle passes cost a branch
-        def go_on(carry, _):
+        def go_on(carry: tuple[RigidBodies, Array], _) -> tuple[tuple[RigidBodies, Array], None]:
             state, going = carry
             after = lax.cond(any_lane(going), sweep, lambda state: state, state)
             changed = jnp.any(after.momentum != state.momentum) | jnp.any(after.position != state.position)

@@ -80,10 +80,10 @@ def collide(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
         return scene.replace(state=_resolve_at_step_end(motion, scene, t, dt))
 
     @jax.checkpoint  # reverse mode computes each leg again: storing what it needs of one costs more than the work
-    def advance(leg):
+    def advance(leg: _StepProgress) -> _StepProgress:
         return choose_lanes(leg.arrived, leg, _advance_leg(motion, scene, leg, t, dt))
 
-    def go_on(leg, _):
+    def go_on(leg: _StepProgress, _) -> tuple[_StepProgress, None]:
         return lax.cond(any_lane(~leg.arrived), advance, lambda leg: leg, leg), None
 
     leg, _ = lax.scan(go_on, leg, length=MAX_IMPACTS + 1)
@@ -106,7 +106,7 @@ def fold_body_flights(
         leg_start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, dt.shape), t)
         return add(total, _build_flight(motion, scene, thrust, leg_start, dt, after, None)), after
 
-    def fly(leg, total):
+    def fly(leg: _StepProgress, total: Total) -> tuple[_StepProgress, Total]:
         leg_start, rest = _split_remaining_step(leg, t, dt)
         here = scene.replace(state=leg.state)
         facing = use_facing_surfaces(here, leg_start)
@@ -117,7 +117,7 @@ def fold_body_flights(
         flight = _build_flight(motion, here, thrust, leg_start, duration, after.state, ~leg.arrived)
         return after, add(total, flight)
 
-    def go_on(carry, _):
+    def go_on(carry: tuple[_StepProgress, Total], _) -> tuple[tuple[_StepProgress, Total], None]:
         return lax.cond(any_lane(~carry[0].arrived), fly, lambda *carry: carry, *carry), None
 
     (leg, total), _ = lax.scan(go_on, (leg, total), length=MAX_IMPACTS + 1)
@@ -229,7 +229,7 @@ def _find_event_time(
     (dip, hit, on), rest = lax.stop_gradient((watched, rest))
     falls = dip.last <= 1
 
-    def find_lowest_point(duration, scene, thrust, on, leg_start):
+    def find_lowest_point(duration: Array, scene: Scene, thrust: Thrust, on: Array, leg_start: Time) -> Array:
         state = move_with_reactions(motion, scene, thrust, leg_start, duration)
         return jnp.min(
             jnp.where(on, jnp.inf, gather_point_states(scene, leg_start + duration, state).signed_distance), axis=0

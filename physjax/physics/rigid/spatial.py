@@ -83,9 +83,10 @@ class OnBodies(Load):
 
     def __init__(self, function: Callable[..., Wrench], couples: bool = False):
         self.function = Function(function)
-        self.couples = couples
+        # a field where other forces have a class attribute: both are read the same way
+        self.couples = couples  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def wrench(self, t: ArrayLike, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
         """The function's wrench."""
         return self.function(t, bodies, inertia)
 

@@ -51,7 +51,7 @@ class SurfaceContact(PointContact):
     surface: Surface
 
     @property
-    def response(self) -> Callable[..., Scene]:
+    def response(self) -> Callable[..., Scene]:  # pyright: ignore[reportIncompatibleVariableOverride]  # as in `Surface`
         """How its contacts are resolved: `collide`."""
         return collide
 

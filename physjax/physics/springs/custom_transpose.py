@@ -17,10 +17,11 @@ from jaxtyping import Array
 _linear_primitive = Primitive("linear_with_transpose")
 _linear_primitive.multiple_results = True
 
+LinearMap = Callable[..., list[Array]]
+"""A linear function of arrays that gives a list of arrays."""
 
-def apply_linear(
-    forward: Callable[..., list[Array]], backward: Callable[..., list[Array]], arrays: Sequence[Array]
-) -> list[Array]:
+
+def apply_linear(forward: LinearMap, backward: LinearMap, arrays: Sequence[Array]) -> list[Array]:
     """`forward(*arrays)`, a list of arrays that depends linearly on them, with `backward` as its transpose.
 
     Both must accept any leading axes as batch axes, and must not close over traced arrays: they are parameters of the
@@ -30,26 +31,30 @@ def apply_linear(
 
 
 @_linear_primitive.def_impl
-def _apply_forward(*arrays, forward, backward):
+def _apply_forward(*arrays: Array, forward: LinearMap, backward: LinearMap) -> list[Array]:
     return forward(*arrays)
 
 
 @_linear_primitive.def_abstract_eval
-def _infer_shapes(*arrays, forward, backward):
+def _infer_shapes(*arrays: ShapedArray, forward: LinearMap, backward: LinearMap) -> list[ShapedArray]:
     shapes = jax.eval_shape(forward, *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in arrays))
     return [ShapedArray(s.shape, s.dtype) for s in shapes]
 
 
-def _differentiate(primals, tangents, **maps):
+def _differentiate(
+    primals: Sequence[Array], tangents: Sequence[Array | ad.Zero], **maps: LinearMap
+) -> tuple[list[Array], list[Array]]:
     tangents = [ad.instantiate_zeros(t) for t in tangents]
     return _linear_primitive.bind(*primals, **maps), _linear_primitive.bind(*tangents, **maps)
 
 
-def _transpose(cotangents, *arrays, forward, backward):
+def _transpose(
+    cotangents: Sequence[Array | ad.Zero], *arrays: object, forward: LinearMap, backward: LinearMap
+) -> list[Array]:
     return _linear_primitive.bind(*(ad.instantiate_zeros(c) for c in cotangents), forward=backward, backward=forward)
 
 
-def _batch(arrays, axes, **maps):
+def _batch(arrays: Sequence[Array], axes: Sequence[int | None], **maps: LinearMap) -> tuple[list[Array], list[int]]:
     size = next(a.shape[i] for a, i in zip(arrays, axes, strict=True) if i is not None)
     front = [
         jnp.broadcast_to(a, (size, *a.shape)) if i is None else jnp.moveaxis(a, i, 0)

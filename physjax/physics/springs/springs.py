@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.backend import block_fusion
 from physjax.checks import NestedArrayLike, as_positive_integer, as_real_quantity, unchecked_quantity
+from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.physics.springs.jacobian import LinearisedSlot, LinearisedSprings, product, spring_jacobian_coefficients
@@ -56,7 +57,7 @@ class Springs(Force):
     ):
         self.topology = SpringTopology(pairs, None if nodes is None else as_positive_integer("nodes", nodes), layout)
         self.k = self._lay_out("stiffness [N/m]", stiffness)
-        self.L = self._lay_out("rest length [m]", rest_length)
+        self.L = self._lay_out("rest length [m]", rest_length)  # pyright: ignore[reportConstantRedefinition]  # a length
         self.c = None if damping is None else self._lay_out("damping [kg/s]", damping)
         self.limit = None if breaks_at is None else self._lay_out("breaks_at [1]", breaks_at)
         self.intact = None
@@ -124,7 +125,7 @@ class Springs(Force):
             pulls.append(topology.neighbours.scale_edges(weight, edge))
         return topology.resultant(pulls)
 
-    def linearised_at(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> LinearisedSprings:
+    def linearised_at(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> LinearisedSprings:
         """The springs linearised at a state, with a negative semidefinite Jacobian, as an implicit step uses them."""
         springs = []
         x = state.position
@@ -138,7 +139,7 @@ class Springs(Force):
             )
             gamma = None if self.c is None else jnp.where(unbroken, self._take_slot(slot, self.c, d), 0.0) / apart
             springs.append(LinearisedSlot(edge, d, g, h, gamma))
-        return LinearisedSprings(self.topology, state, self(t, state, mass), springs)
+        return LinearisedSprings(self.topology, state, self(to_float_time(t), state, mass), springs)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
         """½k(l - L)² [J], half of it at each end."""

@@ -195,7 +195,7 @@ def _observe_motion(
     if timed:
         return RESPONSE_OBSERVERS[timed[0]](motion, scene, t, dt, record, budget)
     moved = motion(scene, t, dt).state
-    return record(budget, Flight(scene.state, scene, t, dt, moved, moved, None)), moved  # pyright: ignore[reportArgumentType]  # None: all lanes
+    return record(budget, Flight(scene.state, scene, t, dt, moved, moved, None)), moved
 
 
 def _measure_path_error(

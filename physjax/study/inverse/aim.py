@@ -320,4 +320,4 @@ def _check_problem(scene: Scene, target: ArrayLike, method: Callable[..., PyTree
         demand_all("distance from launch to target [m]", away, known_away > 0, "a target away from the launch")
     at_rest = Particles(position, jnp.zeros_like(position))
     stepper = as_module(method)
-    return AimProblem(scene.replace(state=at_rest), target, stepper, steps)  # pyright: ignore[reportArgumentType]  # it is callable
+    return AimProblem(scene.replace(state=at_rest), target, stepper, steps)
