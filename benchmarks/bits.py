@@ -202,7 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     recording = commands.add_parser("record", help="run the scenes and keep their states")
     recording.add_argument("file", type=Path, metavar="FILE.npz")
-    comparing = commands.add_parser("compare", help="tell how far two recordings lie apart")
+    comparing = commands.add_parser("compare", help="report how far two recordings lie apart")
     comparing.add_argument("before", type=Path, metavar="BEFORE.npz")
     comparing.add_argument("after", type=Path, metavar="AFTER.npz")
     comparing.add_argument("--ulps", type=float, default=0.0, help="differences up to so many pass (%(default)s)")
