@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import concrete_or_none
@@ -134,7 +133,7 @@ class Trajectory(eqx.Module):
         held = "ok" if ok.all() else f"{ok.size - ok.sum()} of {ok.size} blew up"
         return f"<Trajectory: {how}{len(time)} frames from t = {time.min():g} to {time.max():g} s, {shape}, {held}>"
 
-    def crossing(self, surface: Callable | ArrayLike, *, direction: int | None = None) -> Crossing:
+    def crossing(self, surface: PyTree, *, direction: int | None = None) -> Crossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 
         `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
