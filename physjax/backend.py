@@ -307,7 +307,7 @@ def count_lane_blocks(lanes: int, steps_per_frame: int) -> int | None:
 
 
 def choose_block_lanes(device: Device, carried_bytes: int) -> int:
-    """Lanes in a block of a sweep on a device, where each carries so many bytes through a loop.
+    """Lanes in a block of a sweep on a device, given the bytes that each carries through a loop.
 
     A CPU is fastest in its cache, anything else with all that it can hold.
     """

@@ -21,10 +21,10 @@ from physjax.checks import Numbers, quantity
 from physjax.closures import warn_of_recompilation
 from physjax.cubics import Cubic
 from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
-from physjax.particles import append_axes, demand_particles
+from physjax.particles import demand_particles
 from physjax.parts import as_module
 from physjax.roots import find_first_root
-from physjax.vectors import norm
+from physjax.vectors import add_trailing_axes, norm
 
 NODES_PER_BATCH = 64
 """Nodes of a coupled scene whose crossings are searched at once, each with a copy of the scene: a bound on memory."""
@@ -157,7 +157,7 @@ def _find_unit_crossings(run: PyTree, signed_distance: Callable, way: Array, own
 
     def forward(i, moving):
         after = replay.step(moving, replay.moment(place.frame, i), replay.dt)
-        return jax.tree.map(lambda a, b: jnp.where(append_axes(i < place.step, a), a, b), after, moving)
+        return jax.tree.map(lambda a, b: jnp.where(add_trailing_axes(i < place.step, a.ndim), a, b), after, moving)
 
     if replay.steps_per_frame > 1:
         moving = repeat_steps(forward, moving, jnp.zeros((), jnp.int32), replay.steps_per_frame - 1)
@@ -175,7 +175,7 @@ def _find_unit_crossings(run: PyTree, signed_distance: Callable, way: Array, own
     search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
     duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))  # pyright: ignore[reportCallIssue]  # a custom derivative hides its signature
     x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
-    reported = lambda leaf: jnp.where(append_axes(place.found, leaf), leaf, jnp.nan)  # noqa: E731
+    reported = lambda leaf: jnp.where(add_trailing_axes(place.found, leaf.ndim), leaf, jnp.nan)  # noqa: E731
     return Crossing(reported(to_float_time(begun + duration)), reported(x), reported(v), place.found)
 
 

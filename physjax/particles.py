@@ -252,8 +252,3 @@ def check_load_shape(force: Callable, value: object, expected: Array) -> Array:
         f"force {name}: got an array of shape {shape} and dtype {dtype}, expected {expected.shape} and {expected.dtype} "
         "like the velocity. Build it from state and mass, and keep other numbers Python floats or fields of a module."
     )
-
-
-def append_axes(number: Array, like: Array) -> Array:
-    """A number of each scene or lane, with the axes of an array of the state."""
-    return number.reshape(number.shape + (1,) * (like.ndim - number.ndim))

@@ -46,13 +46,14 @@ FORCE_OLD_NAMES = {
     "near": "linearised_at",
     "definite": "dissipative_symmetric",
 }
+"""What the abilities of a force were called in the first edition."""
 CONTACT_OLD_NAMES = {
     "gap": "signed_distance",
     "answered": "resolve",
     "forgetting": "forget_lanes",
     "prepared": "prepare",
 }
-"""What abilities were called in the first edition."""
+"""What the methods of a contact were called in the first edition."""
 
 
 class Force(eqx.Module):

@@ -13,7 +13,7 @@ from physjax.backend import block_fusion
 from physjax.checks import concrete_or_none, unchecked_quantity
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
-from physjax.vectors import components, stack_components
+from physjax.vectors import add_trailing_axes, components, stack_components
 
 
 class Pins(eqx.Module):
@@ -83,8 +83,7 @@ class Pins(eqx.Module):
 
     def _clock(self, t: ArrayLike, state: Particles) -> Array:
         """The time in the state's dtype, with axes for the lanes of each scene where scenes have times of their own."""
-        t = jnp.asarray(t, state.dtype)
-        return t.reshape(t.shape + (1,) * (len(state.lanes) - t.ndim)) if t.ndim else t
+        return add_trailing_axes(jnp.asarray(t, state.dtype), len(state.lanes))
 
     def _motion(self, t: ArrayLike, state: Particles) -> tuple[Array, Array]:
         """Position [m] and velocity [m/s] of the path, for all lanes."""

@@ -288,14 +288,6 @@ class Scene(eqx.Module):
             motion = Partial(response, motion) if ours else Partial(respond_at_float_time, as_module(response), motion)
         return motion
 
-    def advance_memory(self, t: ArrayLike, dt: ArrayLike) -> "Scene":
-        """The scene after each force with memory has advanced by a step from t to t + dt."""
-        scene = self
-        for i, force in enumerate(self.forces):
-            if force.remembers:
-                scene = _advance_force(i, scene, t, dt)
-        return scene
-
     def replace(self, **parts: PyTree) -> "Scene":
         """The scene with some of its parts replaced, unchecked."""
         names = list(parts)

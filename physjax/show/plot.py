@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 MAX_DRAWN_LANES = 200
-"""The most lanes of which paths are drawn; in a picture of more, single paths cannot be told apart."""
+"""The most lanes of which paths are drawn; in a picture of more, single paths cannot be distinguished."""
 MAX_OPAQUE_LANES = 60
 """From this many lanes on paths are drawn with some transparency, so that dense places look dense."""
 

@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from physjax.backend import any_lane
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.loops import Time, moment_at, to_float_time
-from physjax.particles import append_axes, demand_particles
+from physjax.particles import demand_particles
 from physjax.parts import Force, as_module
 from physjax.scene import Scene, project
 from physjax.stepping.registry import PromisingMethod
 from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
-from physjax.vectors import norm
+from physjax.vectors import add_trailing_axes, norm
 
 SAFETY_FACTOR, LECTURE_SAFETY_FACTOR = 0.8, 0.9
 """The next step relative to the one that would just keep the tolerance: ours rejects fewer steps than the lecture's."""
@@ -114,7 +114,7 @@ class Adaptive(eqx.Module):
         ok = reduce(jnp.logical_and, legal, ~end.failed & ~end.going(dt))
         # a product, not `where`: the derivatives of a failed lane must be NaN as well, and `where` would make them zero
         state = jax.tree.map(
-            lambda leaf: leaf * append_axes(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf), end.state
+            lambda leaf: leaf * add_trailing_axes(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf.ndim), end.state
         )
         return Steps(state, end.accepted, end.rejected, end.shortest, ok)
 
@@ -139,7 +139,7 @@ class Adaptive(eqx.Module):
         # cut short by the end, a step says little about how long the next may be
         longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
         return _Progress(
-            state=jax.tree.map(lambda a, b: jnp.where(append_axes(good, a), a, b), halves, walk.state),
+            state=jax.tree.map(lambda a, b: jnp.where(add_trailing_axes(good, a.ndim), a, b), halves, walk.state),
             elapsed=jnp.where(good, jnp.where(last, stop, walk.elapsed + h), walk.elapsed),
             h=jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
             accepted=walk.accepted + good.astype(jnp.int32),
@@ -193,7 +193,7 @@ class Adaptive(eqx.Module):
         size, speed = _scaled_norm(state, tolerance, shape), _scaled_norm(slope, tolerance, shape)
         small = 0.01 * jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1.0), 1e30)
         small = jnp.clip(small, SHORTEST_STEP_SHARE * dt, dt)
-        ahead = jax.tree.map(lambda y, k: y + append_axes(small, y) * k, state, slope)
+        ahead = jax.tree.map(lambda y, k: y + add_trailing_axes(small, y.ndim) * k, state, slope)
         turn = jax.tree.map(lambda a, b: a - b, system.rate(t + small, ahead), slope)
         second_derivative = jnp.maximum(_scaled_norm(turn, tolerance, shape) / small, 1e-30)
         # half of y'' dt² is what a step of first order misses

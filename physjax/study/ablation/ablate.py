@@ -161,8 +161,8 @@ def ablate(
 
     Example:
         >>> height = lambda flight: flight.position[-1, 1]
-        >>> told = accuracy.ablate(shot, height, method=methods.verlet, dt=0.1, duration=2.0, seconds=0.1)
-        >>> round(float(told["Gravity"].change), 3), told["Gravity"].verdict
+        >>> result = accuracy.ablate(shot, height, method=methods.verlet, dt=0.1, duration=2.0, seconds=0.1)
+        >>> round(float(result["Gravity"].change), 3), result["Gravity"].verdict
         (19.6, 'needed')
     """
     _check_outcome(outcome)
