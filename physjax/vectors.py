@@ -11,6 +11,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -19,10 +20,12 @@ AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 def dot(a: Float[Array, "*lanes dim"], b: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
     """Scalar product a·b, shaped like the lanes."""
-    total = a[..., 0] * b[..., 0]
-    for i in range(1, a.shape[-1]):
-        total = total + a[..., i] * b[..., i]
-    return total
+    # the component stays an axis of length 1 until the end, which takes half of the operations of picking each one
+    product = a * b
+    total = product[..., :1]
+    for i in range(1, product.shape[-1]):
+        total = total + product[..., i : i + 1]
+    return total.reshape(total.shape[:-1])
 
 
 def components(v: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes"]]:
@@ -76,8 +79,7 @@ def _norm_jvp(primals, tangents):
 def unit(v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """Direction v/|v|; the zero vector has the direction zero, and derivative zero."""
     length = norm(v)
-    present = length > 0
-    return scale(jnp.where(present, 1.0 / jnp.where(present, length, 1.0), 0.0), v)
+    return scale(jnp.where(length > 0, 1.0 / length, 0.0), v)
 
 
 @unit.defjvp
@@ -90,15 +92,13 @@ def _unit_jvp(primals, tangents):
 
 def cross(a: Float[Array, "*lanes 3"], b: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """Vector product a × b in three dimensions."""
-    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return jnp.stack([x, y, z], axis=-1)
+    (ax, ay, az), (bx, by, bz) = ([vector[..., i : i + 1] for i in range(3)] for vector in (a, b))
+    return jnp.concatenate([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def turn_left(v: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
     """e_z × v in the plane: v rotated by 90 degrees anticlockwise."""
-    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+    return jnp.concatenate([-v[..., 1:], v[..., :1]], axis=-1)
 
 
 def spin(omega: Float[Array, "..."], v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
@@ -113,6 +113,8 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
     number = jnp.asarray(number)
     if number.ndim == 0:
         return number * array
+    if number.shape == array.shape[: number.ndim]:
+        return lax.broadcast_in_dim(number, array.shape, range(number.ndim)) * array
     return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
 
 
