@@ -3,12 +3,13 @@
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -39,6 +40,23 @@ def find_plain_functions(part: PyTree) -> list[Function]:
     """The plain functions in a part of a scene or a method, however deep. What they close over cannot be seen."""
     is_plain = lambda node: isinstance(node, Function)  # noqa: E731
     return [node for node in jax.tree.leaves(part, is_leaf=is_plain) if is_plain(node)]
+
+
+def holds_user_code(part: PyTree) -> bool:
+    """Whether anything in a part of a scene, a method or a motion is not the library's own, and may close over a number."""
+    if isinstance(part, Function):
+        return not _is_library_definition(part.function)
+    if isinstance(part, Partial) and not _is_library_definition(part.func):
+        return True
+    if isinstance(part, eqx.Module) and not _is_library_definition(type(part)):
+        return True
+    children = jax.tree.leaves(part, is_leaf=lambda node: node is not part)
+    return any(holds_user_code(child) for child in children if child is not part)
+
+
+def _is_library_definition(definition: Any) -> bool:
+    """Whether a function or class is the library's own, which closes over nothing."""
+    return getattr(definition, "__module__", "").startswith("physjax.") and "<locals>" not in definition.__qualname__
 
 
 FORCE_OLD_NAMES = {

@@ -4,8 +4,9 @@ A room of sixty walls then costs what one wall costs to compile: only kinds are 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
@@ -13,11 +14,11 @@ from jaxtyping import PyTree
 P = TypeVar("P")
 
 
-class Stack(NamedTuple, Generic[P]):
+class Stack(eqx.Module, Generic[P]):
     """Parts of one kind: one part whose arrays have them along a leading axis, and the places they had among all parts."""
 
     part: P
-    places: tuple[int, ...]
+    places: tuple[int, ...] = eqx.field(static=True)
 
 
 def stack_alike(parts: Sequence[P]) -> tuple[Stack[P], ...]:

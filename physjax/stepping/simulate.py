@@ -24,7 +24,7 @@ from physjax.backend import MIN_LANES_TO_SELECT, jit_untransformed, split_compil
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
-from physjax.parts import as_module, find_plain_functions
+from physjax.parts import as_module, find_plain_functions, holds_user_code
 from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, select_stateful_parts
@@ -154,20 +154,8 @@ def _is_compile_bound(scene: Scene) -> bool:
 
 def _is_untransformed(run: tuple) -> bool:
     """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
-    scene, method, *_ = run
-    path = () if scene.prescribed_motion is None else (scene.prescribed_motion.path,)
-    source = () if scene.emitter is None else (scene.emitter.source,)
-    parts = (*scene.forces, *scene.contacts, *path, *source, method)
-    ours = all(
-        map(_is_library_definition, (*map(type, parts), *(plain.function for plain in find_plain_functions(parts))))
-    )
     traced = any(isinstance(leaf, Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
-    return ours and not traced
-
-
-def _is_library_definition(definition: Any) -> bool:
-    """Whether a function or class is the library's own, which closes over nothing."""
-    return getattr(definition, "__module__", "").startswith("physjax.") and "<locals>" not in definition.__qualname__
+    return not traced and not holds_user_code(run[:2])
 
 
 def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:

@@ -1,25 +1,24 @@
-"""The contact mode of each lane for a step: which surfaces carry it, and whether it sticks, slides or lifts off.
+"""The contact mode of each lane for a leg of a step: which surfaces carry it, and whether it sticks, slides or lifts off.
 
-Decided once, at the start of a step: a surface lets go of a lane where the forces pull it off; a lane that stands still
-sticks where static friction suffices; else it slides. The decision is in arrays of zeros and ones, so that the step
-itself has no branches.
+Decided once, at the start of a leg: a surface lets go of a lane where the forces pull it off; a lane that stands still
+sticks where static friction suffices; else it slides. A decision has no derivatives; what follows from it has.
 """
 
-from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
-from physjax.backend import any_lane, bounded_while_loop, materialise_where
+from physjax.backend import any_lane, bounded_while_loop
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
-from physjax.physics.contacts.face import ContactFace
-from physjax.physics.contacts.resting import Reaction, add_scaled, dot_components
+from physjax.physics.contacts.resting import Reaction
+from physjax.physics.contacts.surfaces import Surfaces, Touch, mask_surfaces, relative_to
 from physjax.scene import Scene
-from physjax.vectors import components, dot, scale, stack_components, unit
+from physjax.vectors import dot, norm, scale, unit
 
 MAX_SETTLING_PASSES = 400
 """Most passes over several surfaces that carry one lane: each shrinks the residual by cos² of the angle between them."""
@@ -38,217 +37,228 @@ PLACE_ROUNDING = 64
 
 
 class ContactMode(NamedTuple):
-    """What is decided at the start of a step, as arrays, which is all that a branch of a program may return.
+    """What is decided at the start of a leg, without derivatives.
 
-    `state` is the state put onto the surfaces that carry it; `since` [s], `pressed` and `slip` are per surface: begin of
-    contact (∞: none), 1 for the lanes it carries, and the direction of their slip; `still` is 1 for lanes that stick.
+    `pressed` says which surfaces carry each lane, `still` which lanes stick. A lane presses on no more surfaces than
+    space has dimensions: `slip` is the direction in which it slips on the first of them, the second and so on.
     """
 
-    state: Particles
-    since: tuple[Array, ...]
-    pressed: tuple[Array, ...]
-    slip: tuple[Array | None, ...]
-    still: Array
+    pressed: Bool[Array, "surfaces *lanes"]
+    still: Bool[Array, "*lanes"]
+    slip: Float[Array, "places *lanes dim"] | None
 
 
-def decide_contact_mode(
-    scene: Scene, surfaces: tuple[ContactFace, ...], since: tuple[Array, ...], t: Time, dt: ArrayLike
-) -> ContactMode:
-    """The mode of each lane for the coming step; `since` [s] is its begin of contact with each surface (∞: none)."""
-    flag = jnp.isfinite(jnp.stack(since))
-    unheld = lax.stop_gradient(
-        materialise_where(flag, lambda: scene.acceleration(t, scene.state), scene.state.velocity)
-    )
-    time, load_speed_squared = to_float_time(t), dot(unheld, unheld) * (dt * dt)
-    touching = [
-        jnp.isfinite(start) & _is_close(surface, scene.state, load_speed_squared, time, dt)
-        for surface, start in zip(surfaces, since, strict=True)
-    ]
-    masks = [touch.astype(scene.state.dtype) for touch in touching]
-    at = lax.stop_gradient(_project_onto_surfaces(surfaces, masks, time, scene.state, flag))
+def decide_contact_mode(scene: Scene, surfaces: Surfaces, since: Array, t: Time, dt: ArrayLike) -> ContactMode:
+    """The mode of each lane for the coming leg; `since` [s] is its begin of contact with each surface (∞: none).
 
-    def build():
-        speed = dot(scene.state.velocity, scene.state.velocity) + load_speed_squared
-        return [_build_contact_state(s, time, at, mask, speed) for s, mask in zip(surfaces, masks, strict=True)]
-
-    contacts, unheld = lax.stop_gradient(materialise_where(flag, build)), components(unheld)
-    pressed, still, slip = materialise_where(flag, lambda: _decide_mode(surfaces, contacts, unheld, touching))
-    since = tuple(jnp.where(p > 0, s, jnp.inf) for p, s in zip(pressed, since, strict=True))
-    # a lane that sticks to a surface that does not move keeps its place to the last bit, so that nothing creeps
-    moves = [p * (1 - still) if s.velocity is None else p for p, s in zip(pressed, surfaces, strict=True)]
-    x, v = _project_onto_surfaces(surfaces, moves, time, scene.state, flag)
-    for surface, p in zip(surfaces, pressed, strict=True):
-        v = v - scale(still * p, surface.relative(v))
-    return ContactMode(Particles(x, v), since, pressed, slip, still)
-
-
-def _decide_mode(
-    surfaces: tuple[ContactFace, ...], contacts: list["_ContactState"], unheld: list[Array], touching: list[Array]
-) -> tuple[tuple[Array, ...], Array, tuple[Array | None, ...]]:
-    """Which surfaces carry each lane, which lanes stick, and in which direction the others slip.
-
-    A lane lifts off where the surface would have to pull it. It sticks where all surfaces that carry it find it still
-    and normal forces and static friction balance the load.
+    A surface lets go where it would have to pull. A lane sticks where all surfaces that carry it find it still and
+    normal forces and static friction balance the load.
     """
-    acceleration, normal_force = _solve_contact_forces(contacts, unheld)
-    pressed = [
-        touch & ~((force <= 0) & (dot_components(acceleration, contact.normal) + contact.curvature_acceleration > 0))
-        for touch, force, contact in zip(touching, normal_force, contacts, strict=True)
-    ]
+    scene, surfaces, dt = lax.stop_gradient((scene, surfaces, dt))
+    state, eps = scene.state, float(jnp.finfo(scene.state.dtype).eps)
+    load, time = scene.acceleration(t, state), to_float_time(t)
+    touch, load_squared = surfaces.measure(time, state), dot(load, load)
+    load_speed_squared = load_squared * (dt * dt)
+    touching = jnp.isfinite(since) & _is_close(touch, state, load_speed_squared, dt)
+    contacts = _build_contact_states(surfaces, touch, time, state, touching, load_speed_squared)
+    left, normal_force = _solve_contact_forces(contacts, load)
+    away = dot(jnp.broadcast_to(left, touch.normal.shape), touch.normal) + contacts.curvature_acceleration
+    pressed = touching & ~((normal_force <= 0) & (away > 0))
     # sticking takes both: no slip yet, on any surface, and a load that static friction balances
-    quiet = jnp.all(jnp.stack([~p | contact.still for p, contact in zip(pressed, contacts, strict=True)]), axis=0)
-    dtype = unheld[0].dtype
-    eps = float(jnp.finfo(dtype).eps)
+    quiet = jnp.all(~pressed | contacts.still, axis=0)
     # one surface is solved exactly, several by passes that converge slowly where they are nearly parallel
-    left = BALANCE_ROUNDING * eps if len(surfaces) == 1 else eps**0.5
-    balanced = dot_components(acceleration, acceleration) <= left**2 * dot_components(unheld, unheld)
-    still = (jnp.any(jnp.stack(pressed), axis=0) & quiet & balanced).astype(dtype)
-    pressed = tuple(p.astype(dtype) for p in pressed)
-    slip = []
-    for surface, contact, p in zip(surfaces, contacts, pressed, strict=True):
+    rounding = BALANCE_ROUNDING * eps if len(surfaces) == 1 else eps**0.5
+    still = jnp.any(pressed, axis=0) & quiet & (dot(left, left) <= rounding**2 * load_squared)
+    slip = None
+    if surfaces.rough.any():
         # what stands still and does not stick begins to slip in the direction in which it is accelerated
-        way = [jnp.where(contact.still, a, u) for a, u in zip(acceleration, contact.across, strict=True)]
-        slip.append(None if surface.coulomb is None else scale(p * (1 - still), unit(stack_components(way))))
-    return pressed, still, tuple(slip)
+        way = unit(jnp.where(contacts.still[..., None], left[None], contacts.across))
+        slips = pressed & ~still[None] & mask_surfaces(surfaces.rough, pressed)
+        way = scale(slips.astype(state.dtype), way)
+        slip = select_places(assign_places(pressed, state), way)
+    return ContactMode(pressed, still, slip)
 
 
-def make_free_mode(scene: Scene, surfaces: tuple[ContactFace, ...], since: tuple[Array, ...]) -> ContactMode:
+def make_free_mode(scene: Scene, surfaces: Surfaces) -> ContactMode:
     """The mode where no lane is in contact, shaped like that of `decide_contact_mode`."""
-    # the same tree of arrays as a decision has, because a branch must return the same from both sides
-    nothing, nowhere = jnp.zeros(scene.state.lanes, scene.state.dtype), jnp.zeros_like(scene.state.velocity)
-    slip = tuple(None if surface.coulomb is None else nowhere for surface in surfaces)
-    return ContactMode(scene.state, since, tuple(nothing for _ in surfaces), slip, nothing)
+    lanes, v = scene.state.lanes, scene.state.velocity
+    places = min(len(surfaces), v.shape[-1])
+    slip = jnp.zeros((places, *v.shape), v.dtype) if surfaces.rough.any() else None
+    return ContactMode(jnp.zeros((len(surfaces), *lanes), bool), jnp.zeros(lanes, bool), slip)
 
 
-def apply_contact_mode(scene: Scene, surfaces: tuple[ContactFace, ...], mode: ContactMode) -> Scene:
-    """The scene with the reactions of a mode among its forces, ready for a step."""
-    any_contact = any_lane(jnp.any(jnp.stack(mode.pressed) > 0, axis=0))
-    reaction = Reaction(surfaces, mode.pressed, mode.slip, mode.still, _assign_places(mode), any_contact)
-    return scene.replace(state=mode.state, reaction=reaction)
+def apply_contact_mode(scene: Scene, surfaces: Surfaces, mode: ContactMode, t: Time) -> Scene:
+    """The scene with each lane put onto what carries it, and the reactions of a mode among its forces."""
+    state, any_contact = scene.state, any_lane(mode.pressed)
+    places = assign_places(mode.pressed, state)
+    pressed = mode.pressed if places is None else jnp.any(places, axis=1)
+    number = lambda flag: flag.astype(state.dtype)  # noqa: E731
+    reaction = Reaction(surfaces, places, number(pressed), number(mode.still), mode.slip, any_contact)
+    put = lambda: _put_on_surfaces(surfaces, mode, to_float_time(t), state)  # noqa: E731
+    return scene.replace(state=lax.cond(any_contact, put, lambda: state), reaction=reaction)
 
 
-def _assign_places(mode: ContactMode) -> tuple[tuple[Array, ...], ...] | None:
+def assign_places(pressed: Array, state: Particles) -> Bool[Array, "places surfaces *lanes"] | None:
     """For each place, which surface takes it, lane by lane; None where every surface has a place of its own."""
-    dim = mode.state.position.shape[-1]
-    if len(mode.pressed) <= dim:
+    dim = state.position.shape[-1]
+    if len(pressed) <= dim:
         return None
     # a running count over the surfaces: the first that presses on a lane takes its first place
-    before, ranks = jnp.zeros_like(mode.still), []
-    for pressed in mode.pressed:
-        ranks.append(before)
-        before = before + pressed
-    return tuple(
-        tuple(jnp.where(rank == place, pressed, 0.0) for pressed, rank in zip(mode.pressed, ranks, strict=True))
-        for place in range(dim)
-    )
+    rank = jnp.cumsum(pressed.astype(jnp.int32), axis=0)
+    return pressed[None] & (rank[None] == jnp.arange(1, dim + 1).astype(rank.dtype).reshape(-1, *(1,) * rank.ndim))
 
 
-class _ContactState(NamedTuple):
-    """A lane at a surface: normal, curvature acceleration, tangential velocity, and the limit μ_s of static friction.
+def select_places(places: Array | None, values: Array) -> Array:
+    """Of each place the value of the surface that takes it: a sum, of which all shares but one are zero."""
+    if places is None:
+        return values
+    mask = places if places.ndim == values.ndim + 1 else places[..., None]
+    return jnp.sum(jnp.where(mask, values[None], 0.0), axis=1)
 
-    The lane is `still` where that velocity is rounding. Vectors are lists of components.
+
+class _ContactStates(NamedTuple):
+    """The lanes at all surfaces: normals, curvature acceleration, tangential velocity, the limit μ_s of static friction.
+
+    A lane is `still` where that velocity is rounding.
     """
 
     touching: Array
-    normal: list[Array]
+    normal: Array
     curvature_acceleration: Array
-    across: list[Array]
-    still: Bool[Array, "*lanes"]
+    across: Array
+    still: Bool[Array, "surfaces *lanes"]
     limit: Array | None
 
 
-def _build_contact_state(
-    surface: ContactFace, t: ArrayLike, state: Particles, touching: Array, speed_squared: Array
-) -> _ContactState:
-    """The lanes at a surface; slower than rounding of the speeds that occur in a step (`speed_squared`) is still."""
-    normal_at, relative = surface.normal_at(t, state.position), surface.relative(state.velocity)
-    normal, across = components(normal_at), components(relative)
-    across = add_scaled(across, -dot_components(across, normal), normal)
+def _build_contact_states(
+    surfaces: Surfaces, touch: Touch, t: ArrayLike, state: Particles, touching: Array, load_speed_squared: Array
+) -> _ContactStates:
+    """The lanes at all surfaces; slower than rounding of the speeds that occur in a step is still."""
+    number = touching.astype(state.dtype)
+    _, v = _slide_along(touch, number, _find_grip(surfaces, number), state)
+    relative = relative_to(touch.carried, v, len(surfaces))
+    across = relative - scale(dot(relative, touch.normal), touch.normal)
     rounding = STILL_ROUNDING * float(jnp.finfo(state.dtype).eps)
-    still = dot_components(across, across) <= rounding**2 * speed_squared
-    limit = None if surface.coulomb is None else surface.coulomb.static
-    if surface.friction is not None:
-        # a lane comes to rest by infinitely many bounces, each of which takes the share K_f: nothing is left
-        limit = jnp.where(surface.friction > 0, STICKING_FRICTION_COEFFICIENT, 0.0).astype(state.dtype)
-    return _ContactState(
-        touching, normal, surface.curvature_acceleration(t, state.position, relative), across, still, limit
+    speed_squared = dot(state.velocity, state.velocity) + load_speed_squared
+    still = dot(across, across) <= rounding**2 * speed_squared
+    turn = surfaces.curvature_acceleration(t, state)
+    return _ContactStates(
+        number,
+        touch.normal,
+        jnp.zeros_like(touch.distance) if turn is None else turn,
+        across,
+        still,
+        _find_sticking_limit(surfaces, state.lanes),
     )
 
 
-_Forces = tuple[list[Array], list[Array], list[list[Array]]]
-"""The acceleration left over, and the normal force and the friction of each surface; vectors are lists of components."""
+def _find_sticking_limit(surfaces: Surfaces, lanes: tuple[int, ...]) -> Array | None:
+    """The coefficient of static friction of every surface; None where no surface has friction."""
+    limit, friction = surfaces.static_friction(lanes), surfaces.friction(lanes)
+    if friction is None:
+        return limit
+    # a lane comes to rest by infinitely many bounces, each of which takes the share K_f: nothing is left
+    sticky = jnp.where(friction > 0, STICKING_FRICTION_COEFFICIENT, 0.0).astype(friction.dtype)
+    return sticky if limit is None else jnp.maximum(sticky, limit)
 
 
-def _solve_contact_forces(contacts: list[_ContactState], acceleration: list[Array]) -> tuple[list[Array], list[Array]]:
+def _find_grip(surfaces: Surfaces, touching: Array) -> Array | None:
+    """Where K_f takes the whole tangential velocity of a lane that a surface carries; None without such friction."""
+    friction = surfaces.friction(touching.shape[1:])
+    return None if friction is None else jnp.where(friction > 0, touching, 0.0)
+
+
+_Forces = tuple[Array, Array, Array | None]
+"""The acceleration left over, and the normal force and the friction of each surface."""
+
+
+def _solve_contact_forces(contacts: _ContactStates, load: Array) -> tuple[Array, Array]:
     """The acceleration left over under normal forces and static friction, and the normal forces.
 
     Projected Gauss-Seidel: surface by surface, each normal force is what keeps the lane from going in, given the others,
     and the friction what keeps a still lane in place, cut to Coulomb's cone.
     """
 
-    def sweep(forces: _Forces) -> _Forces:
-        total, normal_force, friction = forces
-        normal_force, friction = list(normal_force), list(friction)
-        for i, c in enumerate(contacts):
-            # the force that this surface had is taken back, and what is needed now is put in its place
-            now = c.touching * jnp.maximum(
-                normal_force[i] - dot_components(total, c.normal) - c.curvature_acceleration, 0.0
-            )
-            total = add_scaled(total, now - normal_force[i], c.normal)
-            normal_force[i] = now
-            if c.limit is not None:
-                along = add_scaled(total, -dot_components(total, c.normal), c.normal)
-                wanted = [f - a for f, a in zip(friction[i], along, strict=True)]
-                size = jnp.sqrt(dot_components(wanted, wanted))
-                share = jnp.where(size > c.limit * now, c.limit * now / jnp.where(size > 0, size, 1.0), 1.0)
-                held = [jnp.where(c.still, share, 0.0) * part for part in wanted]
-                total = [a + h - f for a, h, f in zip(total, held, friction[i], strict=True)]
-                friction[i] = held
-        return total, normal_force, friction
+    def turn(total: Array, one: tuple[_ContactStates, Array, Array | None]) -> tuple[Array, tuple]:
+        c, force, friction = one
+        # the force that this surface had is taken back, and what is needed now is put in its place
+        now = c.touching * jnp.maximum(force - dot(total, c.normal) - c.curvature_acceleration, 0.0)
+        total = total + scale(now - force, c.normal)
+        if c.limit is None:
+            return total, (now, None)
+        wanted = friction - (total - scale(dot(total, c.normal), c.normal))
+        size, most = norm(wanted), c.limit * now
+        share = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0)
+        held = scale(jnp.where(c.still, share, 0.0), wanted)
+        return total + held - friction, (now, held)
 
-    nothing = jnp.zeros_like(acceleration[0])
-    forces = (acceleration, [nothing for _ in contacts], [[nothing for _ in acceleration] for _ in contacts])
-    if len(contacts) == 1:
-        return sweep(forces)[:2]
-    rounding = (SETTLED_ROUNDING * float(jnp.finfo(nothing.dtype).eps)) ** 2 * dot_components(
-        acceleration, acceleration
+    def sweep(forces: _Forces) -> _Forces:
+        total, pushes = scan_surfaces(turn, forces[0], (contacts, *forces[1:]))
+        return (total, *pushes)
+
+    forces = (
+        load,
+        jnp.zeros_like(contacts.touching),
+        None if contacts.limit is None else jnp.zeros_like(contacts.normal),
     )
+    if len(contacts.touching) == 1:
+        return sweep(forces)[:2]
+    rounding = (SETTLED_ROUNDING * float(jnp.finfo(load.dtype).eps)) ** 2 * dot(load, load)
 
     def repeat(carry: tuple[_Forces, Array]) -> tuple[_Forces, Array]:
-        before, _ = carry
-        after = sweep(before)
-        moved = [a - b for a, b in zip(after[0], before[0], strict=True)]
-        return after, dot_components(moved, moved) > rounding
+        after = sweep(carry[0])
+        moved = after[0] - carry[0][0]
+        return after, dot(moved, moved) > rounding
 
     start = forces, rounding >= 0
     return bounded_while_loop(lambda carry: any_lane(carry[1]), repeat, start, most=MAX_SETTLING_PASSES)[0][:2]
 
 
-def _is_close(surface: ContactFace, state: Particles, load_speed_squared: Array, t: ArrayLike, dt: ArrayLike) -> Array:
+def scan_surfaces(turn, carry, each):
+    """`lax.scan` over the axis of surfaces; a single one takes its turn without a loop."""
+    if jax.tree.leaves(each)[0].shape[0] > 1:
+        return lax.scan(turn, carry, each)
+    carry, out = turn(carry, jax.tree.map(lambda leaf: leaf[0], each))
+    return carry, jax.tree.map(lambda leaf: leaf[None], out)
+
+
+def _is_close(touch: Touch, state: Particles, load_speed_squared: Array, dt: ArrayLike) -> Array:
     """Whether a lane is where a step along the surface can have left it; a state that was replaced need not be."""
     x, v = state
-    relative = surface.relative(v)
-    reach = REACH_SHARE * dt * (jnp.sqrt(dot(relative, relative)) + jnp.sqrt(dot(v, v)))
-    rounding = (
-        PLACE_ROUNDING * float(jnp.finfo(state.dtype).eps) * (jnp.sqrt(dot(x, x)) + dt * jnp.sqrt(load_speed_squared))
+    speed = norm(v)
+    moves = speed[None] + (speed[None] if touch.carried is None else norm(v[None] - touch.carried))
+    rounding = PLACE_ROUNDING * float(jnp.finfo(state.dtype).eps) * (norm(x) + dt * jnp.sqrt(load_speed_squared))
+    return jnp.abs(touch.distance) <= REACH_SHARE * dt * moves + rounding
+
+
+def _put_on_surfaces(surfaces: Surfaces, mode: ContactMode, t: ArrayLike, state: Particles) -> Particles:
+    """The state put onto what carries it, its velocity along it: this removes the last step's truncation error."""
+    pressed, still = mode.pressed.astype(state.dtype), mode.still.astype(state.dtype)
+    # a lane that sticks to a surface that does not move keeps its place to the last bit, so that nothing creeps
+    moves = jnp.where(mask_surfaces(surfaces.moves, pressed), pressed, pressed * (1 - still))
+    grip = _find_grip(surfaces, moves)
+    stick = pressed * still
+    return _slide_along(
+        surfaces.measure(t, state), moves, stick if grip is None else jnp.maximum(grip, stick), state
     )
-    return jnp.abs(surface.signed_distance(t, x)) <= reach + rounding
 
 
-def _project_onto_surfaces(
-    surfaces: tuple[ContactFace, ...], touching: list[Array], t: ArrayLike, state: Particles, flag: Array
-) -> Particles:
-    """The state put onto the surfaces, its velocity along them: this removes the last step's truncation error."""
-    for surface, touch in zip(surfaces, touching, strict=True):
-        state = materialise_where(flag, partial(_project_onto_surface, surface, touch, t, state), state)
-    return state
+def _slide_along(touch: Touch, moves: Array, grip: Array | None, state: Particles) -> Particles:
+    """The state moved onto the surfaces where `moves` is 1, one after the other, and its velocity along them.
 
+    Where `grip` is 1 the lane takes over the velocity of the surface.
+    """
 
-def _project_onto_surface(surface: ContactFace, touch: Array, t: ArrayLike, state: Particles) -> Particles:
-    x, v = state
-    normal = surface.normal_at(t, x)
-    x = x - scale(touch * surface.signed_distance(t, x), normal)
-    v = v - scale(touch * dot(surface.relative(v), normal), normal)
-    if surface.friction is not None:
-        v = v - scale(jnp.where(surface.friction > 0, touch, 0.0), surface.relative(v))
-    return Particles(x, v)
+    def turn(carry: tuple[Array, Array], one: tuple[Touch, Array, Array | None]) -> tuple[tuple[Array, Array], None]:
+        (shift, v), (at, move, hold) = carry, one
+        # the distance after what the surfaces before have shifted the lane by
+        shift = shift - scale(move * (at.distance + dot(shift, at.normal)), at.normal)
+        relative = v if at.carried is None else v - at.carried
+        v = v - scale(move * dot(relative, at.normal), at.normal)
+        if hold is not None:
+            v = v - scale(hold, v if at.carried is None else v - at.carried)
+        return (shift, v), None
+
+    start = (jnp.zeros_like(state.position), state.velocity)
+    (shift, v), _ = scan_surfaces(turn, start, (touch, moves, grip))
+    return Particles(state.position + shift, v)

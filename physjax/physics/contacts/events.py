@@ -13,16 +13,21 @@ from jaxtyping import Array, Bool
 
 from physjax.cubics import Cubic
 from physjax.particles import Particles
-from physjax.physics.contacts.contact_mode import ContactMode
-from physjax.physics.contacts.face import ContactFace, Face
+from physjax.physics.contacts.face import Face
+from physjax.physics.contacts.resting import Reaction
+from physjax.physics.contacts.surfaces import Surfaces
+from physjax.stacks import map_stacks
 from physjax.vectors import dot
+
+NEWTON_STEPS = 3
+"""Steps towards the zero of a cubic: from the secant of its ends they reach it to single precision or better."""
 
 
 class Event(NamedTuple):
     """Which lanes have an event within a leg, bracketed between two shares of it, and the guard's values there.
 
-    `above` and `below` are the values of the first guard that falls, at `first` and `last`. `watched` says which guards
-    may end the leg; the others are ignored.
+    `above` and `below` are the values of the first guard that falls, at `first` and `last`; `guess` is where its cubic
+    is zero and `slope` its derivative there. `watched` says which guards may end the leg; the others are ignored.
     """
 
     hit: Bool[Array, "*lanes"]
@@ -30,48 +35,51 @@ class Event(NamedTuple):
     last: Array
     above: Array
     below: Array
-    watched: tuple[Array, ...]
-
-
-def find_next_event(
-    walls: tuple[ContactFace, ...], start: ContactMode, end: Particles, t: ArrayLike, dt: ArrayLike
-) -> Event:
-    """The first event on the path from start to end, bracketed by the cubic through its ends.
-
-    Only a bracket is needed here: the event's time is then a root on the method's own path. Every lane pays for this
-    test in every step, so it takes few operations.
-    """
-    walls, start, end = lax.stop_gradient((walls, start, end))
-    dips = []
-    for face, pressed in zip(collect_faces(walls, t, start.state), start.pressed, strict=True):
-        dip = find_dip(face, t, dt, start.state, end)
-        # the reaction keeps a lane that presses on a surface on it: rounding there is no impact
-        dips.append(dip._replace(last=jnp.where(pressed > 0, jnp.inf, dip.last)))
-    for wall, slip in zip(walls, start.slip, strict=True):
-        if slip is not None:
-            before, after = (dot(wall.relative(state.velocity), slip) for state in (start.state, end))
-            last = jnp.where((before > 0) & (after <= 0), 1.0, jnp.inf)
-            dips.append(Dip(jnp.zeros_like(last), last, before, after))
-    last = jnp.min(jnp.stack([dip.last for dip in dips]), axis=0)
-    first = jnp.min(jnp.stack([jnp.where(dip.last <= 1, dip.first, jnp.inf) for dip in dips]), axis=0)
-    above, below = jnp.zeros_like(last), jnp.zeros_like(last)
-    # by a choice for each guard: an index that differs from lane to lane would be a gather
-    for dip in dips:
-        above = jnp.where(dip.last == last, dip.above, above)
-        below = jnp.where(dip.last == last, dip.below, below)
-    return Event(last <= 1, first, last, above, below, tuple(dip.last <= 1 for dip in dips))
+    guess: Array
+    slope: Array
+    watched: Bool[Array, "guards *lanes"]
 
 
 class Dip(NamedTuple):
     """Where a signed distance falls below zero within a leg: after the share `first`, before `last` (∞: nowhere).
 
-    `above` and `below` [m] are its values there.
+    `above` and `below` [m] are its values there, `guess` is where the cubic through the leg's ends is zero.
     """
 
     first: Array
     last: Array
     above: Array
     below: Array
+    guess: Array
+    slope: Array
+
+
+def find_next_event(
+    faces: Surfaces, reaction: Reaction, pressed: Array, start: Particles, end: Particles, t: ArrayLike, dt: ArrayLike
+) -> Event:
+    """The first event on the path from start to end, bracketed by the cubic through its ends.
+
+    Only a bracket is needed here: the event's time is then a root on the method's own path.
+    """
+    dip = map_stacks(lambda face: find_dip(face, t, dt, start, end), faces.stacks)
+    # the reaction keeps a lane that presses on a surface on it: rounding there is no impact
+    dip = dip._replace(last=jnp.where(pressed, jnp.inf, dip.last))
+    before, after = reaction.measure_slides(start), reaction.measure_slides(end)
+    if before is not None and after is not None:
+        stop = _find_stop(before, after)
+        dip = Dip(*(jnp.concatenate([a, b]) for a, b in zip(dip, stop, strict=True)))
+    watched, last = dip.last <= 1, jnp.min(dip.last, axis=0)
+    first = jnp.min(jnp.where(watched, dip.first, jnp.inf), axis=0)
+    soonest = watched & (dip.last == last[None])
+    above, below, guess, slope = (jnp.min(jnp.where(soonest, part, jnp.inf), axis=0) for part in dip[2:])
+    return Event(last <= 1, first, last, above, below, guess, slope, watched)
+
+
+def _find_stop(before: Array, after: Array) -> Dip:
+    """Where slides with these speeds along their first direction, at both ends of a leg, come to a stop."""
+    stops = (before > 0) & (after <= 0)
+    fall = jnp.where(stops, before - after, 1.0)
+    return Dip(jnp.zeros_like(before), jnp.where(stops, 1.0, jnp.inf), before, after, before / fall, -fall)
 
 
 def find_dip(face: Face, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Dip:
@@ -89,30 +97,19 @@ def find_dip(face: Face, t: ArrayLike, dt: ArrayLike, start: Particles, end: Par
     # a lane that just bounced is at zero now as well; behind a part of its way up only the next touch is left
     bounced = (d0 <= float(jnp.finfo(d0.dtype).eps) ** 0.5 * r0) & (r0 > 0) & (highest > 0) & (highest < last)
     first = jnp.where(bounced, 0.1 * highest, 0.0)
+    above = jnp.where(first > 0, cubic.at(first), d0)
     below = jnp.where(last == 1.0, d1, depth)
-    return Dip(first, last, jnp.where(first > 0, cubic.at(first), d0), below)
+    return Dip(first, last, above, below, *_find_zero(cubic, first, last, above, below))
 
 
-def evaluate_guards(
-    faces: list[ContactFace],
-    walls: tuple[ContactFace, ...],
-    start: ContactMode,
-    event: Event,
-    t: ArrayLike,
-    state: Particles,
-) -> list[Array]:
-    """The guards of a leg at a time t [s]; those that are not watched are infinite.
+def _find_zero(cubic: Cubic, first: Array, last: Array, above: Array, below: Array) -> tuple[Array, Array]:
+    """Where a cubic that falls from `above` to `below` between two shares is zero, and its slope there."""
+    fall = above - below
+    start = first + (last - first) * (above / jnp.where(fall > 0, fall, 1.0))
 
-    The faces are those of the beginning of the leg: a moving slab may since have passed the place where a lane was, and
-    would then show it the other face.
-    """
-    values = [face.signed_distance(t, state.position) for face in faces]
-    for wall, slip in zip(walls, start.slip, strict=True):
-        if slip is not None:
-            values.append(dot(wall.relative(state.velocity), slip))
-    return [jnp.where(watched, value, jnp.inf) for watched, value in zip(event.watched, values, strict=True)]
+    def improve(_, s: Array) -> Array:
+        slope = cubic.slope(s)
+        return jnp.clip(s - cubic.at(s) / jnp.where(slope < 0, slope, -jnp.inf), first, last)
 
-
-def collect_faces(walls: tuple[ContactFace, ...], t: ArrayLike, state: Particles) -> list[ContactFace]:
-    """The surfaces as each lane meets them from where it is: of a slab, the nearer face."""
-    return [wall.facing(t, state.position) for wall in walls]
+    s = lax.fori_loop(0, NEWTON_STEPS, improve, start)
+    return s, cubic.slope(s)

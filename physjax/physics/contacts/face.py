@@ -57,6 +57,7 @@ class Face(Protocol):
 class ContactFace(Face, Material, Protocol):
     """A surface that particles can rest on: its geometry with its curvature, restitution and friction."""
 
+    curved: bool
     velocity: OptionalNumbers
     touching_since: OptionalNumbers
 
@@ -69,7 +70,7 @@ class ContactFace(Face, Material, Protocol):
         ...
 
     def may_meet(
-        self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
+        self, touching: Array, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
     ) -> Bool[Array, "*lanes"]:
         """Whether a lane may meet the surface within a step."""
         ...

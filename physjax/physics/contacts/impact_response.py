@@ -1,107 +1,157 @@
-"""What an impact makes of a lane and of its contacts: a bounce, coming to rest, or the end of a slide."""
+"""What an impact makes of a lane and of its contacts: a bounce, coming to rest, or the end of a slide.
+
+What happens is decided once, without derivatives (`judge_event`); what follows from it is a smooth function of
+everything (`respond_to_event`), so that a replay with the same decisions can be differentiated.
+"""
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Int
 
-from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
-from physjax.physics.contacts.contact_mode import ContactMode
-from physjax.physics.contacts.events import Event, collect_faces, evaluate_guards
-from physjax.physics.contacts.face import ContactFace
 from physjax.physics.contacts.legs import SHORTEST_FLIGHT_SHARE, choose_lanes
+from physjax.physics.contacts.resting import Reaction
 from physjax.physics.contacts.restitution import apply_restitution
-from physjax.scene import Scene
+from physjax.physics.contacts.surfaces import Surfaces, Touch, relative_to, select_surface
 from physjax.vectors import dot
 
-REACHED_ROUNDING = 64
-"""Units of rounding of its place within which a lane has reached a surface."""
 STOPPED_SPEED_SQUARED_SHARE = 0.25
 """Share of its speed² at the start of the leg below which a slide has stopped; above, it only turned."""
 LEAVING_ROUNDING = 16
 """Units of rounding of the speed that a step's load gives below which a lane does not leave a surface."""
 
 
-def resolve_contact(
-    scene: Scene,
-    walls: tuple[ContactFace, ...],
-    start: ContactMode,
-    event: Event,
-    leg_start: Time,
-    impact_time: Time,
+class Verdict(NamedTuple):
+    """What ends a leg: which guard, whether its lane bounces there, comes to rest by that bounce, or stops sliding."""
+
+    guard: Int[Array, "*lanes"]
+    bounces: Bool[Array, "*lanes"]
+    rests: Bool[Array, "*lanes"]
+    stops: Bool[Array, "*lanes"]
+
+
+class _Dry(NamedTuple):
+    """Coulomb's friction of the surface that each lane meets."""
+
+    static: Array
+    kinetic: Array
+
+
+class Meeting(NamedTuple):
+    """Where lanes are at the end of a leg: relative to every surface, and to the one that each meets.
+
+    `chosen` says which that is; `distance` [m], `normal`, `relative` velocity [m/s] and material are of that one, and
+    `turn` [m/s²] is what its curvature adds to the second derivative of the distance. `slip` is the velocity relative to
+    the surface on which a slide ends [m/s]; None where nothing slides.
+    """
+
+    touch: Touch
+    chosen: Bool[Array, "surfaces *lanes"]
+    distance: Array
+    normal: Array
+    relative: Array
+    turn: Array | None
+    restitution: Array
+    friction: Array | None
+    coulomb: _Dry | None
+    slip: Array | None
+
+
+def measure_guards(faces: Surfaces, reaction: Reaction, t: ArrayLike, state: Particles) -> Array:
+    """The guards of a leg at a time t [s]: the signed distances to the faces, then the speeds of the slides.
+
+    The faces are those of the beginning of the leg: a moving slab may since have passed the place where a lane was, and
+    would then show it the other face.
+    """
+    distance, slide = faces.signed_distance(t, state.position), reaction.measure_slides(state)
+    return distance if slide is None else jnp.concatenate([distance, slide])
+
+
+def meet_surface(
+    faces: Surfaces, reaction: Reaction, guards: Array, guard: Array, t: ArrayLike, at: Particles
+) -> Meeting:
+    """Where lanes are at a time t [s] when this guard of theirs is zero, given the values of all guards."""
+    count, lanes = len(faces), at.lanes
+    numbers = jnp.arange(len(guards), dtype=guard.dtype).reshape(-1, *(1,) * guard.ndim)
+    chosen = guard[None] == numbers[:count]
+    pick = lambda values: None if values is None else select_surface(chosen, values)  # noqa: E731
+    touch = Touch(guards[:count], faces.normal_at(t, at.position), faces.velocity_at(at.velocity))
+    carried, static, kinetic = pick(touch.carried), faces.static_friction(lanes), faces.kinetic_friction(lanes)
+    slip = None
+    if reaction.slip is not None:
+        belt = reaction.carry(at)
+        slip = at.velocity if belt is None else at.velocity - select_surface(guard[None] == numbers[count:], belt)
+    return Meeting(
+        touch,
+        chosen,
+        select_surface(chosen, touch.distance),
+        select_surface(chosen, touch.normal),
+        at.velocity if carried is None else at.velocity - carried,
+        pick(faces.curvature_acceleration(t, at)),
+        select_surface(chosen, faces.restitution(lanes)),
+        pick(faces.friction(lanes)),
+        None if static is None or kinetic is None else _Dry(pick(static), pick(kinetic)),
+        slip,
+    )
+
+
+def judge_event(
+    meeting: Meeting,
+    guard: Array,
+    reached: Array,
+    load: Array,
+    before: Particles,
     at: Particles,
     dt: Array,
-) -> tuple[Particles, tuple[Array, ...]]:
-    """State after the events that end a leg, and since when [s] each lane is in contact with each wall."""
-    acceleration, t = scene.acceleration(impact_time, at), to_float_time(impact_time)
-    faces = collect_faces(walls, to_float_time(leg_start), start.state)
-    guards = jnp.stack(evaluate_guards(faces, walls, start, event, t, at))
-    # the root search ended at one guard's zero: that is the smallest
-    which = jnp.argmin(guards, axis=0)
-    # a path that just misses a surface, though its cubic did not, goes on as it was
-    eps = float(jnp.finfo(at.dtype).eps)
-    reached = REACHED_ROUNDING * eps * jnp.sqrt(dot(at.position, at.position)) + eps**0.5 * (event.above - event.below)
-    touches = event.hit & (jnp.min(guards, axis=0) <= lax.stop_gradient(reached))
-    state, since = at, list(start.since)
-    # one guard ends the leg of a lane: each response starts from the same state, and is taken where it applies
-    for i, face in enumerate(faces):
-        state, since[i] = _bounce(face, touches & (which == i), acceleration, t, (at, state), since[i], dt)
-    state = _stop_slides(walls, touches, which, start, at, state)
-    bounced, load_speed_squared = touches & (which < len(walls)), dot(acceleration, acceleration) * (dt * dt)
-    for i, wall in enumerate(walls):
-        # a bounce off one surface throws a lane off another, or into it, which then is a new contact
-        since[i] = jnp.where(
-            bounced & (which != i) & _is_leaving(wall, t, state, load_speed_squared), jnp.inf, since[i]
-        )
-    return state, tuple(since)
+) -> tuple[Verdict, Array]:
+    """What happens to lanes that have `reached` the zero of a guard, and how long the bounces last that follow [s].
 
-
-def _bounce(
-    face: ContactFace,
-    here: Array,
-    acceleration: Array,
-    t: ArrayLike,
-    states: tuple[Particles, Particles],
-    since: Array,
-    dt: Array,
-) -> tuple[Particles, Array]:
-    """The lanes that are `here` after a bounce, and their begin of contact [s], if it was the last bounce.
-
-    `states` are that at the impact, and what other surfaces have made of it in other lanes. The flights that would follow
-    a last bounce with the speed v take 2v/(g(1 - K_r)) together, a geometric series: the lane is at rest after that.
+    `load` is the acceleration there, `before` and `at` are the states at both ends of the leg. The flights that would follow a last
+    bounce with the speed v take 2v/(g(1 - K_r)) together, a geometric series: the lane is at rest after that.
     """
-    at, state = states
-    normal, relative = face.normal_at(t, at.position), face.relative(at.velocity)
-    inward = jnp.where(here, jnp.minimum(dot(relative, normal), 0.0), 0.0)
-    lift = face.restitution * -inward
-    weight = -(dot(acceleration, normal) + face.curvature_acceleration(t, at.position, relative))
+    on_surface = jnp.any(meeting.chosen, axis=0)
+    bounces = reached & on_surface
+    lift = meeting.restitution * -_find_inward_speed(meeting, bounces)
+    weight = -dot(load, meeting.normal)
+    if meeting.turn is not None:
+        weight = weight - meeting.turn
     # K_r = 1 never rests, unless it came with no normal velocity at all
-    rests = here & (2 * lift <= SHORTEST_FLIGHT_SHARE * dt * weight) & ((face.restitution < 1) | (lift == 0))
-    contact = (face.signed_distance(t, at.position), normal, relative)
-    state = choose_lanes(here, apply_restitution(face, at, contact, inward, rests), state)
-    flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - face.restitution), 1.0)
-    return state, jnp.where(rests, t + flights, since)
+    rests = bounces & (2 * lift <= SHORTEST_FLIGHT_SHARE * dt * weight) & ((meeting.restitution < 1) | (lift == 0))
+    flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - meeting.restitution), 1.0)
+    stops = jnp.zeros_like(reached)
+    if meeting.slip is not None:
+        # one that only turned, on a curved surface, also crosses zero along its first direction
+        then = meeting.slip + (before.velocity - at.velocity)
+        slowed = dot(meeting.slip, meeting.slip) < STOPPED_SPEED_SQUARED_SHARE * dot(then, then)
+        stops = reached & ~on_surface & slowed
+    return Verdict(guard, bounces, rests, stops), flights
 
 
-def _stop_slides(
-    walls: tuple[ContactFace, ...], touches: Array, which: Array, start: ContactMode, at: Particles, state: Particles
-) -> Particles:
-    """The lanes whose slide ends the leg brought to rest on their surface: friction does not push them back."""
-    slides = [i for i, slip in enumerate(start.slip) if slip is not None]
-    for guard, i in enumerate(slides, start=len(walls)):
-        relative, before = walls[i].relative(at.velocity), walls[i].relative(start.state.velocity)
-        # a slide that only turned, on a curved surface, also crosses zero along its first direction
-        slowed = dot(relative, relative) < STOPPED_SPEED_SQUARED_SHARE * dot(before, before)
-        stopped = Particles(at.position, at.velocity - relative)
-        state = choose_lanes(touches & (which == guard) & slowed, stopped, state)
-    return state
+def respond_to_event(meeting: Meeting, verdict: Verdict, at: Particles) -> Particles:
+    """The state after the event that ends a leg; a slide that stops is not pushed back by friction."""
+    contact = (meeting.distance, meeting.normal, meeting.relative)
+    bounced = apply_restitution(meeting, at, contact, _find_inward_speed(meeting, verdict.bounces), verdict.rests)
+    state = choose_lanes(verdict.bounces, bounced, at)
+    if meeting.slip is None:
+        return state
+    return choose_lanes(verdict.stops, Particles(at.position, at.velocity - meeting.slip), state)
 
 
-def _is_leaving(wall: ContactFace, t: ArrayLike, state: Particles, load_speed_squared: Array) -> Array:
-    """Whether a lane moves off a surface, or into it, faster than rounding of its speed and of a step's load."""
-    relative, eps = wall.relative(state.velocity), float(jnp.finfo(state.dtype).eps)
-    normal_speed = dot(relative, wall.normal_at(t, state.position))
-    return (
-        normal_speed * normal_speed > eps * dot(relative, relative) + (LEAVING_ROUNDING * eps) ** 2 * load_speed_squared
-    )
+def update_contact_starts(
+    since: Array, meeting: Meeting, verdict: Verdict, rest_time: Array, state: Particles, load_speed: Array
+) -> Array:
+    """Since when [s] each lane is in contact with each surface, after the event that ends a leg."""
+    here, touch = meeting.chosen & verdict.bounces[None], meeting.touch
+    since = jnp.where(here & verdict.rests[None], rest_time[None], since)
+    # a bounce off one surface throws a lane off another, or into it, which then is a new contact
+    relative, eps = relative_to(touch.carried, state.velocity, len(since)), float(jnp.finfo(state.dtype).eps)
+    speed = dot(relative, touch.normal)
+    leaves = speed * speed > eps * dot(relative, relative) + ((LEAVING_ROUNDING * eps * load_speed) ** 2)[None]
+    return jnp.where(verdict.bounces[None] & ~here & leaves, jnp.inf, since)
+
+
+def _find_inward_speed(meeting: Meeting, bounces: Array) -> Array:
+    """The normal velocity <= 0 with which lanes go into what they bounce off [m/s], zero for all others."""
+    return jnp.where(bounces, jnp.minimum(dot(meeting.relative, meeting.normal), 0.0), 0.0)

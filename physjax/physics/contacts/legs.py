@@ -61,13 +61,18 @@ def choose_lanes(flag: Array, a: Tree, b: Tree) -> Tree:
 
 def is_overrun(surfaces: Sequence[Face], start: ArrayLike, end: ArrayLike, state: Located) -> Bool[Array, "*lanes"]:
     """Whether a surface moves over a lane that stays where it is from one time [s] to another."""
-    x = lax.stop_gradient(state.position)
-    rounding = OVERRUN_ROUNDING * float(jnp.finfo(x.dtype).eps) * jnp.sqrt(dot(x, x))
-    over = jnp.zeros(rounding.shape, bool)
+    over = jnp.zeros(state.position.shape[:-1], bool)
     for surface in surfaces:
-        before, after = (lax.stop_gradient(surface.clearance(t, state)) for t in (start, end))
-        over = over | ((after < -rounding) & (after < before - rounding))
+        before, after = (surface.clearance(t, state) for t in (start, end))
+        over = over | has_moved_over(before, after, state.position)
     return over
+
+
+def has_moved_over(before: Array, after: Array, position: Array) -> Bool[Array, "..."]:
+    """Whether a surface is over a place that it was not over before, given its signed distances [m] then and now."""
+    before, after, x = lax.stop_gradient((before, after, position))
+    rounding = OVERRUN_ROUNDING * float(jnp.finfo(x.dtype).eps) * jnp.sqrt(dot(x, x))
+    return (after < -rounding) & (after < before - rounding)
 
 
 def invalidate_lanes(overrun: Bool[Array, "*lanes"], state: Tree) -> Tree:

@@ -42,12 +42,38 @@ class Coulomb(eqx.Module):
 
 
 @runtime_checkable
+class DryFriction(Protocol):
+    """Coefficients of static and of kinetic friction."""
+
+    @property
+    def static(self) -> Numbers:
+        """μ_s."""
+        ...
+
+    @property
+    def kinetic(self) -> Numbers:
+        """μ_k."""
+        ...
+
+
+@runtime_checkable
 class Material(Protocol):
     """What a contact needs to know of a surface besides its geometry."""
 
-    restitution: Numbers
-    friction: OptionalNumbers
-    coulomb: Coulomb | None
+    @property
+    def restitution(self) -> Numbers:
+        """K_r."""
+        ...
+
+    @property
+    def friction(self) -> OptionalNumbers:
+        """The lecture's K_f."""
+        ...
+
+    @property
+    def coulomb(self) -> DryFriction | None:
+        """Coulomb's friction."""
+        ...
 
 
 def apply_restitution(

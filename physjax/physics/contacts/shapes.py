@@ -271,13 +271,6 @@ class Room(Surface):
         normals = [wall.normal_at(t, position) for wall in self.walls()]
         return sum_terms([scale((nearest == i).astype(position.dtype), n) for i, n in enumerate(normals)])
 
-    def may_meet(
-        self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
-    ) -> Bool[Array, "*lanes"]:
-        """Whether a lane may meet a wall within a step, or stop on one it slides along."""
-        flags = [w.may_meet([touch], t, dt, start, end) for w, touch in zip(self.walls(), touching, strict=True)]
-        return jnp.any(jnp.stack(flags), axis=0)
-
     def respond(self, t: ArrayLike, state: Particles) -> Particles:
         """Wall by wall: in a corner two or three of them respond."""
         for wall in self.walls():

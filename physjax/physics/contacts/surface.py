@@ -144,14 +144,14 @@ class Surface(Contact):
         return find_path_dip(self, t, dt, start, end, dip) if self.curved else dip
 
     def may_meet(
-        self, touching: list[Array], t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
+        self, touching: Array, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
     ) -> Bool[Array, "*lanes"]:
         """Whether a lane may meet the surface within a step, or, where it slides already (`touching`), may stop."""
         before, after = self.relative(start.velocity), self.relative(end.velocity)
         meets = self.facing(t, start.position).may_dip(t, dt, start, end)
         if self.coulomb is None:
-            return meets & ~touching[0]
-        return jnp.where(touching[0], (dot(before, after) <= 0) & (dot(before, before) > 0), meets)
+            return meets & ~touching
+        return jnp.where(touching, (dot(before, after) <= 0) & (dot(before, before) > 0), meets)
 
     def may_dip(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
         """Whether the signed distance may fall below zero within a step; over a curve, whether the path can reach it."""

@@ -1,0 +1,131 @@
+"""A step flown again with its events known, for derivatives and for the energy budget.
+
+The search finds moments and choices without derivatives. With these given, the legs of a step are a smooth function of
+everything: only the moment of an event still moves, h ← h - (g(h) - g)/s with g the guard and s its slope along the
+method's own step. Its value stays; a pass gives it one order of derivatives (implicit function theorem), and two are made.
+"""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from physjax.backend import any_lane
+from physjax.loops import Time, to_float_time
+from physjax.particles import Particles
+from physjax.physics.contacts.contact_mode import ContactMode, apply_contact_mode, make_free_mode
+from physjax.physics.contacts.impact_response import Verdict, measure_guards, meet_surface, respond_to_event
+from physjax.physics.contacts.legs import MAX_IMPACTS, Flight, Motion, choose_lanes, shortest_duration
+from physjax.physics.contacts.search import Leg, Progress, find_events
+from physjax.physics.contacts.surfaces import Surfaces
+from physjax.scene import Scene
+
+ORDERS = 2
+"""Orders of derivatives that the moment of an event has."""
+
+Total = TypeVar("Total")
+
+
+def log_events(
+    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, active: Array
+) -> tuple[Progress, Leg]:
+    """The step from event to event, and how each of its legs was flown, along a leading axis of legs; no derivatives."""
+    motion, scene, surfaces, t, dt = lax.stop_gradient((motion, scene, surfaces, t, dt))
+    none = jnp.zeros(dt.shape, bool)
+    verdict = Verdict(jnp.zeros(dt.shape, jnp.int32), none, none, none)
+    blank = Leg(jnp.zeros_like(dt), make_free_mode(scene, surfaces), verdict, none)
+    empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (MAX_IMPACTS + 1, *leaf.shape)), blank)
+    return find_events(motion, scene, surfaces, t, dt, active, _log_leg, empty)
+
+
+def _log_leg(legs: Leg, ends: Array, number: Array, leg: Leg) -> Leg:
+    """The log with a leg written at its number in the lanes in which it ends."""
+    here = ends[None] & (number[None] == jnp.arange(MAX_IMPACTS + 1, dtype=number.dtype).reshape(-1, *(1,) * ends.ndim))
+    by_lane = lambda old, new: jnp.where(here, new[None], old)  # noqa: E731
+    pressed = jnp.where(here[:, None], leg.mode.pressed[None], legs.mode.pressed)
+    slip = legs.mode.slip
+    if slip is not None and leg.mode.slip is not None:
+        slip = jnp.where(here[:, None, ..., None], leg.mode.slip[None], slip)
+    return Leg(
+        by_lane(legs.duration, leg.duration),
+        ContactMode(pressed, by_lane(legs.mode.still, leg.mode.still), slip),
+        Verdict(*map(by_lane, legs.verdict, leg.verdict)),
+        by_lane(legs.arrives, leg.arrives),
+    )
+
+
+def replay_step(
+    motion: Motion,
+    scene: Scene,
+    surfaces: Surfaces,
+    t: Time,
+    dt: Array,
+    flown: tuple[Array, Leg],
+    add: Callable[[Total, Flight], Total],
+    total: Total,
+) -> tuple[Particles, Total]:
+    """The state after the legs of a step, and the total of `total = add(total, flight)` over them.
+
+    `flown` is how many legs each lane has, and what is logged of each.
+    """
+
+    @jax.checkpoint  # reverse mode computes each leg again: storing what it needs of one costs more than the work
+    def fly(carry: tuple, leg: Leg, active: Array) -> tuple:
+        elapsed, state, total = carry
+        flight = _fly_leg(motion, scene.replace(state=state), surfaces, t + elapsed, dt - elapsed, leg, active)
+        after = jnp.where(active, elapsed + flight.duration, elapsed), choose_lanes(active, flight.after, state)
+        return (*after, add(total, flight))
+
+    def go_on(carry: tuple, numbered: tuple[Array, Leg]) -> tuple[tuple, None]:
+        number, leg = numbered
+        active = number < flown[0]
+        return lax.cond(any_lane(active), lambda: fly(carry, leg, active), lambda: carry), None
+
+    numbers = jnp.arange(MAX_IMPACTS + 1, dtype=jnp.int32)
+    start = jnp.zeros_like(dt), scene.state, total
+    (_, state, total), _ = lax.scan(go_on, start, (numbers, flown[1]))
+    return state, total
+
+
+def _fly_leg(
+    motion: Motion, scene: Scene, surfaces: Surfaces, leg_start: Time, rest: Array, leg: Leg, active: Array
+) -> Flight:
+    """A leg with its event known: from the scene's state to where the event has led."""
+    held, time = apply_contact_mode(scene, surfaces, leg.mode, leg_start), to_float_time(leg_start)
+    faces = surfaces.facing(time, held.state.position)
+    verdict = leg.verdict
+    ends = active & (verdict.bounces | verdict.stops)
+    logged = jnp.where(leg.arrives, jnp.maximum(rest, shortest_duration(rest)), leg.duration)
+    duration, end, guards = _find_moment(motion, held, faces, leg_start, logged, verdict.guard, ends)
+    meeting = meet_surface(faces, held.reaction, guards, verdict.guard, to_float_time(leg_start + duration), end)
+    after = respond_to_event(meeting, verdict, end)
+    return Flight(scene.state, held, leg_start, duration, end, after, active)
+
+
+def _find_moment(
+    motion: Motion, held: Scene, faces: Surfaces, leg_start: Time, logged: Array, guard: Array, ends: Array
+) -> tuple[Array, Particles, Array]:
+    """The duration of a leg [s] with its derivatives, and the state and the guards after it."""
+
+    def move(duration: Array) -> tuple[Array, tuple[Particles, Array]]:
+        end = motion(held, leg_start, duration).state
+        guards = measure_guards(faces, held.reaction, to_float_time(leg_start + duration), end)
+        own = guard[None] == jnp.arange(len(guards), dtype=guard.dtype).reshape(-1, *(1,) * guard.ndim)
+        return jnp.sum(jnp.where(own, guards, 0.0), axis=0), (end, guards)
+
+    def improve(carry: tuple, last: Array) -> tuple[tuple, None]:
+        def move_again() -> tuple:
+            duration = carry[0]
+            value, slope, there = jax.jvp(move, (duration,), (jnp.ones_like(duration),), has_aux=True)
+            value, slope = value - lax.stop_gradient(value), lax.stop_gradient(slope)
+            falls = ends & (slope < 0) & ~last
+            return duration - jnp.where(falls, value, 0.0) / jnp.where(falls, slope, 1.0), *there
+
+        return lax.cond(last | any_lane(ends), move_again, lambda: carry), None
+
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(move, logged)[1])
+    last = jnp.arange(ORDERS + 1) == ORDERS
+    return lax.scan(improve, (logged, *blank), last)[0]
