@@ -140,7 +140,7 @@ def _build_contact_states(
     across = relative - scale(dot(relative, touch.normal), touch.normal)
     rounding = STILL_ROUNDING * float(jnp.finfo(state.dtype).eps)
     speed_squared = dot(state.velocity, state.velocity) + load_speed_squared
-    still = dot(across, across) <= rounding**2 * speed_squared
+    still = dot(across, across) <= (rounding**2 * speed_squared)[None]
     turn = surfaces.curvature_acceleration(t, state)
     return _ContactStates(
         number,
@@ -228,12 +228,12 @@ def _is_close(touch: Touch, state: Particles, load_speed_squared: Array, dt: Arr
     speed = norm(v)
     moves = speed[None] + (speed[None] if touch.carried is None else norm(v[None] - touch.carried))
     rounding = PLACE_ROUNDING * float(jnp.finfo(state.dtype).eps) * (norm(x) + dt * jnp.sqrt(load_speed_squared))
-    return jnp.abs(touch.distance) <= REACH_SHARE * dt * moves + rounding
+    return jnp.abs(touch.distance) <= (REACH_SHARE * jnp.broadcast_to(dt, x.shape[:-1]))[None] * moves + rounding[None]
 
 
 def _put_on_surfaces(surfaces: Surfaces, mode: ContactMode, t: ArrayLike, state: Particles) -> Particles:
     """The state put onto what carries it, its velocity along it: this removes the last step's truncation error."""
-    pressed, still = mode.pressed.astype(state.dtype), mode.still.astype(state.dtype)
+    pressed, still = mode.pressed.astype(state.dtype), mode.still.astype(state.dtype)[None]
     # a lane that sticks to a surface that does not move keeps its place to the last bit, so that nothing creeps
     moves = jnp.where(mask_surfaces(surfaces.moves, pressed), pressed, pressed * (1 - still))
     grip = _find_grip(surfaces, moves)

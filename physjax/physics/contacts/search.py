@@ -165,7 +165,7 @@ def _advance(
         since=jnp.where(tries[None], since, now.since),
         mode=mode,
         bracket=bracket,
-        legs=now.legs + arrives,
+        legs=now.legs + arrives.astype(now.legs.dtype),
         arrived=now.arrived | arrives,
     )
     nothing = jnp.zeros(dt.shape, bool)
@@ -257,7 +257,7 @@ def _refine(
         state=choose_lanes(found, state, now.state),
         since=jnp.where(found[None], since, now.since),
         bracket=_choose_bracket(refining, closer._replace(refining=closer.refining & ~found), bracket),
-        legs=now.legs + found,
+        legs=now.legs + found.astype(now.legs.dtype),
     )
     return after, verdict
 

@@ -132,7 +132,7 @@ def _finish(changing, meets, scene, surfaces, t, dt, progress) -> tuple[Particle
         now, state = to_float_time(t + progress.elapsed), progress.state
         faces, x = surfaces.facing(now, state.position), state.position
         before, after = faces.signed_distance(now, x), faces.signed_distance(to_float_time(t + dt), x)
-        return waits & jnp.any(has_moved_over(before, after, x), axis=0)
+        return waits & jnp.any(has_moved_over(before, after, x[None]), axis=0)
 
     state = invalidate_lanes(materialise_where(waits, overrun), progress.state)
     return choose_lanes(meets, state, changing[0]), jnp.where(meets[None], progress.since, changing[1])
