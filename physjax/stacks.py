@@ -15,10 +15,24 @@ P = TypeVar("P")
 
 
 class Stack(eqx.Module, Generic[P]):
-    """Parts of one kind: one part whose arrays have them along a leading axis, and the places they had among all parts."""
+    """Parts of one kind: one part whose arrays have them along a leading axis, and the places they had among all parts.
+
+    A single part keeps its arrays as they are, without the axis: `map` and `replace` know.
+    """
 
     part: P
     places: tuple[int, ...] = eqx.field(static=True)
+
+    def map(self, function: Callable[..., PyTree], *each: PyTree) -> PyTree:
+        """`function(part, *each)` of every part, along a leading axis; `each` has that axis as well."""
+        if len(self.places) > 1:
+            return jax.vmap(function)(self.part, *each)
+        own = jax.tree.map(lambda leaf: leaf[0], each)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], function(self.part, *own))
+
+    def replace(self, function: Callable[[P], P]) -> "Stack[P]":
+        """The stack with `function(part)` in place of every part."""
+        return Stack((jax.vmap(function) if len(self.places) > 1 else function)(self.part), self.places)
 
 
 def stack_alike(parts: Sequence[P]) -> tuple[Stack[P], ...]:
@@ -31,7 +45,11 @@ def stack_alike(parts: Sequence[P]) -> tuple[Stack[P], ...]:
     for place, part in enumerate(parts):
         leaves, structure = jax.tree.flatten(part)
         kinds.setdefault((structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)), []).append(place)
-    stack = lambda places: jax.tree.map(lambda *leaves: jnp.stack(leaves), *[parts[place] for place in places])  # noqa: E731
+
+    def stack(places: list[int]) -> P:
+        first, *others = [parts[place] for place in places]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), first, *others) if others else first
+
     return tuple(Stack(stack(places), tuple(places)) for places in kinds.values())
 
 
@@ -40,5 +58,5 @@ def map_stacks(function: Callable[..., PyTree], stacks: Sequence[Stack[P]], *sha
 
     What comes back must have the same structure, and the same shapes, for all kinds.
     """
-    found = [jax.vmap(lambda part: function(part, *shared))(stack.part) for stack in stacks]
+    found = [stack.map(lambda part: function(part, *shared)) for stack in stacks]
     return found[0] if len(found) == 1 else jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)

@@ -78,8 +78,8 @@ def _norm_jvp(primals, tangents):
 @jax.custom_jvp
 def unit(v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
     """Direction v/|v|; the zero vector has the direction zero, and derivative zero."""
-    length = norm(v)
-    return scale(jnp.where(length > 0, 1.0 / length, 0.0), v)
+    # a zero vector times the inverse of the smallest number there is remains zero
+    return scale(1.0 / jnp.maximum(norm(v), jnp.finfo(v.dtype).tiny), v)
 
 
 @unit.defjvp

@@ -48,16 +48,18 @@ class ContactMode(NamedTuple):
     slip: Float[Array, "places *lanes dim"] | None
 
 
-def decide_contact_mode(scene: Scene, surfaces: Surfaces, since: Array, t: Time, dt: ArrayLike) -> ContactMode:
+def decide_contact_mode(
+    scene: Scene, surfaces: Surfaces, touch: Touch, since: Array, t: Time, dt: ArrayLike
+) -> ContactMode:
     """The mode of each lane for the coming leg; `since` [s] is its begin of contact with each surface (∞: none).
 
     A surface lets go where it would have to pull. A lane sticks where all surfaces that carry it find it still and
     normal forces and static friction balance the load.
     """
-    scene, surfaces, dt = lax.stop_gradient((scene, surfaces, dt))
+    scene, surfaces, touch, dt = lax.stop_gradient((scene, surfaces, touch, dt))
     state, eps = scene.state, float(jnp.finfo(scene.state.dtype).eps)
     load, time = scene.acceleration(t, state), to_float_time(t)
-    touch, load_squared = surfaces.measure(time, state), dot(load, load)
+    load_squared = dot(load, load)
     load_speed_squared = load_squared * (dt * dt)
     touching = jnp.isfinite(since) & _is_close(touch, state, load_speed_squared, dt)
     contacts = _build_contact_states(surfaces, touch, time, state, touching, load_speed_squared)
@@ -87,15 +89,23 @@ def make_free_mode(scene: Scene, surfaces: Surfaces) -> ContactMode:
     return ContactMode(jnp.zeros((len(surfaces), *lanes), bool), jnp.zeros(lanes, bool), slip)
 
 
-def apply_contact_mode(scene: Scene, surfaces: Surfaces, mode: ContactMode, t: Time) -> Scene:
-    """The scene with each lane put onto what carries it, and the reactions of a mode among its forces."""
+def apply_contact_mode(scene: Scene, surfaces: Surfaces, mode: ContactMode) -> Scene:
+    """The scene with the reactions of a mode among its forces."""
     state, any_contact = scene.state, any_lane(mode.pressed)
     places = assign_places(mode.pressed, state)
     pressed = mode.pressed if places is None else jnp.any(places, axis=1)
     number = lambda flag: flag.astype(state.dtype)  # noqa: E731
     reaction = Reaction(surfaces, places, number(pressed), number(mode.still), mode.slip, any_contact)
-    put = lambda: _put_on_surfaces(surfaces, mode, to_float_time(t), state)  # noqa: E731
-    return scene.replace(state=lax.cond(any_contact, put, lambda: state), reaction=reaction)
+    return scene.replace(reaction=reaction)
+
+
+def start_leg(scene: Scene, surfaces: Surfaces, mode: ContactMode, t: Time) -> tuple[Scene, Surfaces]:
+    """The scene as a leg in a known mode begins, differentiable: put onto what carries it; and the faces that it meets."""
+    state, time = scene.state, to_float_time(t)
+    faces = surfaces.facing(time, state.position)
+    put = lambda: put_on_surfaces(faces, faces.measure(time, state), mode, state)  # noqa: E731
+    on = lax.cond(any_lane(mode.pressed), put, lambda: state)
+    return apply_contact_mode(scene.replace(state=on), faces, mode), faces
 
 
 def assign_places(pressed: Array, state: Particles) -> Bool[Array, "places surfaces *lanes"] | None:
@@ -231,16 +241,14 @@ def _is_close(touch: Touch, state: Particles, load_speed_squared: Array, dt: Arr
     return jnp.abs(touch.distance) <= (REACH_SHARE * jnp.broadcast_to(dt, x.shape[:-1]))[None] * moves + rounding[None]
 
 
-def _put_on_surfaces(surfaces: Surfaces, mode: ContactMode, t: ArrayLike, state: Particles) -> Particles:
+def put_on_surfaces(surfaces: Surfaces, touch: Touch, mode: ContactMode, state: Particles) -> Particles:
     """The state put onto what carries it, its velocity along it: this removes the last step's truncation error."""
     pressed, still = mode.pressed.astype(state.dtype), mode.still.astype(state.dtype)[None]
     # a lane that sticks to a surface that does not move keeps its place to the last bit, so that nothing creeps
     moves = jnp.where(mask_surfaces(surfaces.moves, pressed), pressed, pressed * (1 - still))
     grip = _find_grip(surfaces, moves)
     stick = pressed * still
-    return _slide_along(
-        surfaces.measure(t, state), moves, stick if grip is None else jnp.maximum(grip, stick), state
-    )
+    return _slide_along(touch, moves, stick if grip is None else jnp.maximum(grip, stick), state)
 
 
 def _slide_along(touch: Touch, moves: Array, grip: Array | None, state: Particles) -> Particles:

@@ -16,7 +16,7 @@ from jaxtyping import Array
 from physjax.backend import any_lane
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
-from physjax.physics.contacts.contact_mode import ContactMode, apply_contact_mode, make_free_mode
+from physjax.physics.contacts.contact_mode import ContactMode, make_free_mode, start_leg
 from physjax.physics.contacts.impact_response import Verdict, measure_guards, meet_surface, respond_to_event
 from physjax.physics.contacts.legs import MAX_IMPACTS, Flight, Motion, choose_lanes, shortest_duration
 from physjax.physics.contacts.search import Leg, Progress, find_events
@@ -94,8 +94,7 @@ def _fly_leg(
     motion: Motion, scene: Scene, surfaces: Surfaces, leg_start: Time, rest: Array, leg: Leg, active: Array
 ) -> Flight:
     """A leg with its event known: from the scene's state to where the event has led."""
-    held, time = apply_contact_mode(scene, surfaces, leg.mode, leg_start), to_float_time(leg_start)
-    faces = surfaces.facing(time, held.state.position)
+    held, faces = start_leg(scene, surfaces, leg.mode, leg_start)
     verdict = leg.verdict
     ends = active & (verdict.bounces | verdict.stops)
     logged = jnp.where(leg.arrives, jnp.maximum(rest, shortest_duration(rest)), leg.duration)

@@ -51,8 +51,7 @@ class Reaction(eqx.Module):
         if turn is not None:
             wanted = wanted - self._take_places(turn)
         force = _solve_normal_forces(normal, along, wanted, self.pressed)
-        for push, way in zip(force, along, strict=True):
-            acceleration = acceleration + scale(push, way)
+        acceleration = acceleration + (scale(force[0], along[0]) if len(force) == 1 else jnp.sum(scale(force, along), 0))
         # a product and not a choice: `where` between vectors costs several times the step
         return scale(1 - self.still, acceleration)
 
@@ -110,30 +109,34 @@ def _solve_normal_forces(normal: Array, along: Array, wanted: Array, pressed: Ar
     that the first time has left pushing.
     """
     size = len(wanted)
-    if size == 1:
-        weight = dot(normal, along)
-        takes = (pressed > 0) & (weight > PARALLEL_SIN_SQUARED)
-        return jnp.maximum(jnp.where(takes, wanted / jnp.where(takes, weight, 1.0), 0.0), 0.0)
-    rows = jnp.stack([dot(normal, jnp.broadcast_to(way, normal.shape)) for way in along], axis=1)
+    if size == 1:  # friction is across the normal: n·along = 1
+        return jnp.maximum(pressed * wanted, 0.0)
+    pairs = (size, *normal.shape)
+    rows = dot(jnp.broadcast_to(normal[:, None], pairs), jnp.broadcast_to(along[None], pairs))
 
-    def eliminate(presses: Array, _) -> tuple[Array, Array]:
-        force = _eliminate_pressed(rows, wanted, presses)
-        return presses & (force > 0), force
+    def eliminate(force: Array, _) -> tuple[Array, None]:
+        return _eliminate_pressed(rows, wanted, force > 0), None
 
-    _, forces = lax.scan(eliminate, pressed > 0, length=2)
-    return jnp.maximum(forces[-1], 0.0)
+    force, _ = lax.scan(eliminate, pressed, length=2)
+    return jnp.maximum(force, 0.0)
 
 
 def _eliminate_pressed(rows: Array, wanted: Array, presses: Array) -> Array:
     """The x with Σ_j rows_ij x_j = wanted_i over the places that press (Gauss and Jordan), zero at the others."""
-    size, system = len(wanted), jnp.concatenate([rows, wanted[:, None]], axis=1)
-    usable = []
-    for i in range(size):
-        pivot = system[i, i]
-        takes = presses[i] & (pivot > PARALLEL_SIN_SQUARED)
-        row = system[i] * jnp.where(takes, 1.0 / jnp.where(takes, pivot, 1.0), 0.0)
+    size, lanes = len(wanted), wanted.shape[1:]
+    units = jnp.asarray(np.eye(size, size + 1).reshape(size, size + 1, *(1,) * len(lanes)), wanted.dtype)
+
+    def clear_column(carry: tuple[Array, Array], unit: Array) -> tuple[tuple[Array, Array], None]:
+        system, free = carry
+        # a product with a row of the unit matrix picks a row or a column: an index that is traced takes more operations
+        row, column, own = jnp.sum(unit[:size, None] * system, 0), jnp.sum(unit[None] * system, 1), unit[:size]
+        pivot = jnp.sum(own * column, 0)
+        takes = (jnp.sum(own * free, 0) > 0) & (pivot > PARALLEL_SIN_SQUARED)
+        inverse = jnp.where(takes, 1.0 / pivot, 0.0)[None]
         # its own row is divided by the pivot, from the others its share is taken
-        own = (np.arange(size) == i).astype(system.dtype).reshape(-1, *(1,) * (wanted.ndim - 1))
-        system = system - (system[:, i] - own)[:, None] * row[None]
-        usable.append(takes)
-    return jnp.where(jnp.stack(usable), system[:, -1], 0.0)
+        system = system - ((column - own) * inverse)[:, None] * row[None]
+        return (system, free * (1 - own * (inverse == 0).astype(own.dtype))), None
+
+    start = jnp.concatenate([rows, wanted[:, None]], axis=1), presses.astype(wanted.dtype)
+    (system, free), _ = lax.scan(clear_column, start, units)
+    return free * system[:, -1]

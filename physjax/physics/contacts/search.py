@@ -22,6 +22,7 @@ from physjax.physics.contacts.contact_mode import (
     apply_contact_mode,
     decide_contact_mode,
     make_free_mode,
+    put_on_surfaces,
 )
 from physjax.physics.contacts.events import Event, find_next_event
 from physjax.physics.contacts.impact_response import (
@@ -142,21 +143,23 @@ def _advance(
     here = scene.replace(state=now.state)
     # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
     touches = tries & jnp.any(jnp.isfinite(now.since), axis=0) & scene.finite(now.state)
-    decided = materialise_where(
-        touches,
-        lambda: decide_contact_mode(here, surfaces, now.since, leg_start, rest),
-        make_free_mode(scene, surfaces),
-    )
+    start_time = to_float_time(leg_start)
+    faces = surfaces.facing(start_time, now.state.position)
+
+    def decide() -> tuple[ContactMode, Particles]:
+        touch = faces.measure(start_time, now.state)
+        mode = decide_contact_mode(here, faces, touch, now.since, leg_start, rest)
+        return mode, put_on_surfaces(faces, touch, mode, now.state)
+
+    free = make_free_mode(scene, surfaces), now.state
+    decided, put = materialise_where(touches, decide, free)
     mode = choose_mode(tries, decided, now.mode)
     since = jnp.where(mode.pressed, now.since, jnp.inf)
-    held = apply_contact_mode(here, surfaces, mode, leg_start)
     # a lane that refines begins where it was put when it tried
-    held = held.replace(state=choose_lanes(tries, held.state, now.state))
+    held = apply_contact_mode(scene.replace(state=choose_lanes(tries, put, now.state)), faces, mode)
     shortest = shortest_duration(dt)
     duration = jnp.where(refining, jnp.maximum(now.bracket.next, shortest), rest)
     end = materialise_where(going, lambda: motion(held, leg_start, duration).state, now.state)
-    start_time = to_float_time(leg_start)
-    faces = surfaces.facing(start_time, held.state.position)
     bracket = _begin_bracket(held, faces, mode, tries, end, start_time, rest, now.bracket)
     arrives = tries & ~bracket.refining
     at_end = now._replace(

@@ -5,6 +5,7 @@ points to the legal side. Shapes may move with a constant `velocity` [m/s] from 
 bat). The contact response is the same for all of them and stands in `surface`.
 """
 
+from dataclasses import replace
 from typing import ClassVar, TypeVar
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from physjax.vectors import broadcast_vector, dot, norm, scale, unit
 __all__ = ["Plane", "Room", "Slab", "Sphere"]
 
 
+F = TypeVar("F", "Plane", "Slab")
 R = TypeVar("R", bound="Room")
 
 SMALLEST_LENGTH_SQUARED = 1e-30
@@ -43,6 +45,7 @@ class Plane(Surface):
     curved: ClassVar[bool] = False
     point: Numbers = quantity("point of the plane", "m", kind="place")
     normal: Numbers = quantity("normal of the plane", "1", kind="vector")
+    scaled: bool = eqx.field(static=True, default=False, repr=False, kw_only=True)
 
     def __check_init__(self):
         demand_direction("normal of the plane", self.normal)
@@ -57,7 +60,11 @@ class Plane(Surface):
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """N, of length 1."""
-        return broadcast_vector(unit(self.normal), position)
+        return broadcast_vector(_unit_normal(self), position)
+
+    def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
+        """The plane with its normal scaled to length 1, once for all that is asked of it."""
+        return _scale_normal(self)
 
 
 class Slab(Surface):
@@ -75,6 +82,7 @@ class Slab(Surface):
     normal: Numbers = quantity("normal of the slab", "1", kind="vector")
     thickness: Numbers = quantity("thickness", "m", above=0)
     inside: bool = eqx.field(static=True, default=False)
+    scaled: bool = eqx.field(static=True, default=False, repr=False, kw_only=True)
 
     def __check_init__(self):
         demand_direction("normal of the slab", self.normal)
@@ -91,12 +99,12 @@ class Slab(Surface):
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """The normal of the nearer face."""
         side = jnp.where((self._height_above_middle(t, position) < 0) != self.inside, -1.0, 1.0)
-        return scale(side, broadcast_vector(unit(self.normal), position))
+        return scale(side, broadcast_vector(_unit_normal(self), position))
 
     def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
         """The face on the lane's side, as a plane: a fast lane cannot mistake it for the other face."""
         if self.inside:
-            return self  # a lane that passes either face has left the corridor
+            return _scale_normal(self)  # a lane that passes either face has left the corridor
         normal = self.normal_at(t, position)
         return Plane(
             point=broadcast_vector(self.point, position) + scale(self.thickness / 2, normal),
@@ -105,6 +113,7 @@ class Slab(Surface):
             friction=self.friction,
             coulomb=self.coulomb,
             velocity=self.velocity,
+            scaled=True,
         )
 
     def nearest_shares(self, t: ArrayLike, start: Array, end: Array) -> tuple[Array, ...]:
@@ -114,7 +123,15 @@ class Slab(Surface):
         return () if self.inside else (jnp.where(crosses, h0 / jnp.where(crosses, h0 - h1, 1.0), 0.0),)
 
     def _height_above_middle(self, t: ArrayLike, position: Array) -> Array:
-        return _measure_height(self, t, position, broadcast_vector(unit(self.normal), position))
+        return _measure_height(self, t, position, broadcast_vector(_unit_normal(self), position))
+
+
+def _unit_normal(surface: Plane | Slab) -> Array:
+    return surface.normal if surface.scaled else unit(surface.normal)
+
+
+def _scale_normal(surface: F) -> F:
+    return replace(surface, normal=_unit_normal(surface), scaled=True)
 
 
 def _measure_height(surface: Plane | Slab, t: ArrayLike, position: Array, normal: Array) -> Array:
@@ -125,7 +142,7 @@ def _measure_height(surface: Plane | Slab, t: ArrayLike, position: Array, normal
     height = dot(position - broadcast_vector(surface.point, position), normal)
     if surface.velocity is None:
         return height
-    velocity, normal = jnp.broadcast_arrays(surface.velocity, unit(surface.normal))
+    velocity, normal = jnp.broadcast_arrays(surface.velocity, _unit_normal(surface))
     along = dot(velocity, normal)
     # a belt on a slope has rounding for its velocity along the normal; over hours it would sink through the floor
     rounding = VELOCITY_ROUNDING * float(jnp.finfo(along.dtype).eps) * dot(jnp.abs(velocity), jnp.abs(normal))
@@ -159,8 +176,10 @@ class Sphere(Surface):
     def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """|v_t|²/r with r the distance from the center [m/s²]; negative where the inside is legal."""
         offset = self._offset(t, position)
-        distance, across = norm(offset), dot(relative, relative) - dot(relative, unit(offset)) ** 2
-        across = across / jnp.where(distance > 0, distance, 1.0)
+        distance = norm(offset)
+        inverse = 1.0 / jnp.where(distance > 0, distance, 1.0)
+        along = dot(relative, offset) * inverse
+        across = (dot(relative, relative) - along * along) * inverse
         return -across if self.inside else across
 
     @property

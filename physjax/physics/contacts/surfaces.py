@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -68,8 +67,7 @@ class Surfaces(eqx.Module):
 
     def facing(self, t: ArrayLike, position: Array) -> "Surfaces":
         """The surfaces as each lane meets them from where it is: of a slab, the nearer face."""
-        face = jax.vmap(lambda part: part.facing(t, position))
-        return Surfaces(tuple(Stack(face(stack.part), stack.places) for stack in self.stacks))
+        return Surfaces(tuple(stack.replace(lambda part: part.facing(t, position)) for stack in self.stacks))
 
     def signed_distance(self, t: ArrayLike, position: Array) -> Array:
         """Signed distances [m]."""
@@ -104,7 +102,7 @@ class Surfaces(eqx.Module):
         for stack in self.stacks:
             touching = jnp.isfinite(since[first : (first := first + len(stack.places))])
             ask = lambda part, touching: part.may_meet(touching, t, dt, start, end)  # noqa: E731
-            meets = meets | jnp.any(jax.vmap(ask)(stack.part, touching), axis=0)
+            meets = meets | jnp.any(stack.map(ask, touching), axis=0)
         return meets
 
     def restitution(self, lanes: tuple[int, ...]) -> Array:

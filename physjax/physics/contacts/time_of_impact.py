@@ -18,7 +18,7 @@ from physjax.backend import MIN_LANES_TO_SELECT, compact_and_apply, materialise,
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.parts import holds_user_code
-from physjax.physics.contacts.contact_mode import apply_contact_mode, decide_contact_mode, make_free_mode
+from physjax.physics.contacts.contact_mode import ContactMode, decide_contact_mode, make_free_mode, start_leg
 from physjax.physics.contacts.legs import Flight, Motion, choose_lanes, has_moved_over, invalidate_lanes
 from physjax.physics.contacts.replay import log_events, replay_step
 from physjax.physics.contacts.search import find_events
@@ -82,9 +82,13 @@ def _step_in_contact(
     since = surfaces.touching_since
     # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
     touches = jnp.any(jnp.isfinite(since), axis=0) & scene.finite(scene.state)
-    decide = lambda: decide_contact_mode(scene, surfaces, since, t, dt)  # noqa: E731
-    mode = materialise_where(touches, decide, make_free_mode(scene, surfaces))
-    held = apply_contact_mode(scene, surfaces, mode, t)
+
+
+    def decide() -> ContactMode:
+        time = to_float_time(t)
+        return decide_contact_mode(scene, surfaces, surfaces.measure(time, scene.state), since, t, dt)
+
+    held, _ = start_leg(scene, surfaces, mode := materialise_where(touches, decide, make_free_mode(scene, surfaces)), t)
     # computed once: everything that reads it would compute the step again
     end = materialise(to_float_time(t), lambda: motion(held, t, dt).state)
     return end, jnp.where(mode.pressed, since, jnp.inf)
@@ -126,6 +130,9 @@ def _replay_end(flown, motion, changing, meets, scene, surfaces, t, dt):
 
 def _finish(changing, meets, scene, surfaces, t, dt, progress) -> tuple[Particles, Array]:
     """The lanes after a step; those that wait where a surface has moved over them become NaN."""
+    if not surfaces.moves.any():
+        state = progress.state
+        return choose_lanes(meets, state, changing[0]), jnp.where(meets[None], progress.since, changing[1])
     waits = meets & ~progress.arrived
 
     def overrun() -> Array:

@@ -7,6 +7,7 @@ import pytest
 
 from physjax import Particles, Scene, contacts, forces, methods, simulate
 from physjax.physics.contacts.resting import Reaction
+from physjax.physics.contacts.surfaces import Surfaces
 
 G = 9.8
 
@@ -15,9 +16,8 @@ G = 9.8
 def test_the_force_of_a_slide_does_not_depend_on_rounding_of_no_speed(dim):
     """A slide that begins again has the direction that was decided, whatever is left of its speed."""
     slip = np.eye(dim)[0]
-    floor = contacts.Plane(np.zeros(dim), np.eye(dim)[1], coulomb=contacts.Coulomb(0.3, 0.2))
-    one = jnp.ones(())
-    held = Reaction((floor,), (one,), (jnp.asarray(slip),), 0 * one, None, jnp.asarray(True))
+    floor = Surfaces.of([contacts.Plane(np.zeros(dim), np.eye(dim)[1], coulomb=contacts.Coulomb(0.3, 0.2))])
+    held = Reaction(floor, None, jnp.ones(1), jnp.zeros(()), jnp.asarray(slip)[None], jnp.asarray(True))
     pull = -G * np.eye(dim)[1]
 
     @jax.jit
