@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import lax
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
@@ -16,19 +15,19 @@ from jaxtyping import PyTree
 
 
 def differentiate_by_replay(
-    find: Callable[..., tuple], log: Callable[..., tuple], replay: Callable[..., PyTree], *arguments: PyTree
-) -> tuple[PyTree, PyTree]:
-    """`find(*arguments)`, which returns a result and what has no derivatives; those of the result are the replay's.
+    find: Callable[..., PyTree], log: Callable[..., tuple], replay: Callable[..., PyTree], *arguments: PyTree
+) -> PyTree:
+    """`find(*arguments)`, whose derivatives are those of a replay, forward and reverse, as far as the replay has them.
 
     Only where something is differentiated does `log(*arguments)` run instead, which returns what `find` does and a record
-    of what was chosen, and then `replay(record, *arguments)`, which returns the result again. To any order, forward and
-    reverse. What the three close over must not be differentiated: see `hoist_closures`.
+    of what was chosen, and then `replay(record, *arguments)`, which returns the result again, finite everywhere. What the
+    three close over must not be differentiated: see `hoist_closures`.
     """
     leaves, structure = jax.tree.flatten(arguments)
     run = jax.custom_jvp(lambda *leaves: find(*structure.unflatten(leaves)))
 
     def rule(primals: tuple, tangents: tuple) -> tuple:
-        (result, extra), record = log(*structure.unflatten(lax.stop_gradient(list(primals))))
+        result, record = log(*structure.unflatten(lax.stop_gradient(list(primals))))
         # what does not move stays a constant of the replay
         moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
 
@@ -40,7 +39,7 @@ def differentiate_by_replay(
         value, change = jax.jvp(again, *map(tuple, some))
         # the search's own number, to the last bit, with the derivatives of the replay
         value = jax.tree.map(lambda found, flown: found + (flown - lax.stop_gradient(flown)), result, value)
-        return (value, extra), (change, jax.tree.map(jnp.zeros_like, extra))
+        return value, change
 
     run.defjvp(rule, symbolic_zeros=True)
     return run(*leaves)
@@ -48,11 +47,11 @@ def differentiate_by_replay(
 
 def hoist_closures(
     probe: Callable[..., PyTree],
-    find: Callable[..., tuple],
+    find: Callable[..., PyTree],
     log: Callable[..., tuple],
     replay: Callable[..., PyTree],
     *arguments: PyTree,
-) -> tuple[PyTree, PyTree]:
+) -> PyTree:
     """`differentiate_by_replay`, also by numbers that a user's function in the arguments closes over.
 
     `probe(*arguments)` calls all such functions, and is cheap. Only where it meets a number that is being traced are the

@@ -105,28 +105,40 @@ def judge_event(
     before: Particles,
     at: Particles,
     dt: Array,
-) -> tuple[Verdict, Array]:
-    """What happens to lanes that have `reached` the zero of a guard, and how long the bounces last that follow [s].
+) -> Verdict:
+    """What happens to lanes that have `reached` the zero of a guard.
 
-    `load` is the acceleration there, `before` and `at` are the states at both ends of the leg. The flights that would follow a last
-    bounce with the speed v take 2v/(g(1 - K_r)) together, a geometric series: the lane is at rest after that.
+    `load` is the acceleration there, `before` and `at` are the states at both ends of the leg. A lane comes to rest where
+    the flight to the next bounce would be shorter than a share of the step dt.
     """
     on_surface = jnp.any(meeting.chosen, axis=0)
     bounces = reached & on_surface
-    lift = meeting.restitution * -_find_inward_speed(meeting, bounces)
-    weight = -dot(load, meeting.normal)
-    if meeting.turn is not None:
-        weight = weight - meeting.turn
+    lift, weight = _measure_flight(meeting, bounces, load)
     # K_r = 1 never rests, unless it came with no normal velocity at all
     rests = bounces & (2 * lift <= SHORTEST_FLIGHT_SHARE * dt * weight) & ((meeting.restitution < 1) | (lift == 0))
-    flights = 2 * lift / jnp.where(rests & (lift > 0), weight * (1 - meeting.restitution), 1.0)
     stops = jnp.zeros_like(reached)
     if meeting.slip is not None:
         # one that only turned, on a curved surface, also crosses zero along its first direction
         then = meeting.slip + (before.velocity - at.velocity)
         slowed = dot(meeting.slip, meeting.slip) < STOPPED_SPEED_SQUARED_SHARE * dot(then, then)
         stops = reached & ~on_surface & slowed
-    return Verdict(guard, bounces, rests, stops), flights
+    return Verdict(guard, bounces, rests, stops)
+
+
+def measure_last_flights(meeting: Meeting, rests: Array, load: Array) -> Array:
+    """How long all flights take that would follow the last bounce of lanes that come to rest [s].
+
+    They take 2v/(g(1 - K_r)) together, with v the speed of the last bounce: a geometric series.
+    """
+    lift, weight = _measure_flight(meeting, rests, load)
+    return 2 * lift / jnp.where(lift > 0, weight * (1 - meeting.restitution), 1.0)
+
+
+def _measure_flight(meeting: Meeting, bounces: Array, load: Array) -> tuple[Array, Array]:
+    """The speed with which lanes leave the surface [m/s], and how strongly they are pulled back [m/s²]."""
+    weight = -dot(load, meeting.normal)
+    lift = meeting.restitution * -_find_inward_speed(meeting, bounces)
+    return lift, weight if meeting.turn is None else weight - meeting.turn
 
 
 def respond_to_event(meeting: Meeting, verdict: Verdict, at: Particles) -> Particles:

@@ -17,7 +17,13 @@ from physjax.backend import any_lane
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.contact_mode import ContactMode, make_free_mode, start_leg
-from physjax.physics.contacts.impact_response import Verdict, measure_guards, meet_surface, respond_to_event
+from physjax.physics.contacts.impact_response import (
+    Verdict,
+    measure_guards,
+    measure_last_flights,
+    meet_surface,
+    respond_to_event,
+)
 from physjax.physics.contacts.legs import MAX_IMPACTS, Flight, Motion, choose_lanes, shortest_duration
 from physjax.physics.contacts.search import Leg, Progress, find_events
 from physjax.physics.contacts.surfaces import Surfaces
@@ -66,18 +72,19 @@ def replay_step(
     flown: tuple[Array, Leg],
     add: Callable[[Total, Flight], Total],
     total: Total,
-) -> tuple[Particles, Total]:
-    """The state after the legs of a step, and the total of `total = add(total, flight)` over them.
+) -> tuple[Particles, Array, Total]:
+    """The state after the legs of a step, begin of contact [s], and the total of `total = add(total, flight)` over them.
 
     `flown` is how many legs each lane has, and what is logged of each.
     """
 
     @jax.checkpoint  # reverse mode computes each leg again: storing what it needs of one costs more than the work
     def fly(carry: tuple, leg: Leg, active: Array) -> tuple:
-        elapsed, state, total = carry
-        flight = _fly_leg(motion, scene.replace(state=state), surfaces, t + elapsed, dt - elapsed, leg, active)
+        elapsed, state, since, total = carry
+        here = scene.replace(state=state)
+        flight, since = _fly_leg(motion, here, surfaces, since, t + elapsed, dt - elapsed, leg, active)
         after = jnp.where(active, elapsed + flight.duration, elapsed), choose_lanes(active, flight.after, state)
-        return (*after, add(total, flight))
+        return (*after, since, add(total, flight))
 
     def go_on(carry: tuple, numbered: tuple[Array, Leg]) -> tuple[tuple, None]:
         number, leg = numbered
@@ -85,23 +92,34 @@ def replay_step(
         return lax.cond(any_lane(active), lambda: fly(carry, leg, active), lambda: carry), None
 
     numbers = jnp.arange(MAX_IMPACTS + 1, dtype=jnp.int32)
-    start = jnp.zeros_like(dt), scene.state, total
-    (_, state, total), _ = lax.scan(go_on, start, (numbers, flown[1]))
-    return state, total
+    start = jnp.zeros_like(dt), scene.state, surfaces.touching_since, total
+    (_, state, since, total), _ = lax.scan(go_on, start, (numbers, flown[1]))
+    return state, since, total
 
 
 def _fly_leg(
-    motion: Motion, scene: Scene, surfaces: Surfaces, leg_start: Time, rest: Array, leg: Leg, active: Array
-) -> Flight:
-    """A leg with its event known: from the scene's state to where the event has led."""
+    motion: Motion,
+    scene: Scene,
+    surfaces: Surfaces,
+    since: Array,
+    leg_start: Time,
+    rest: Array,
+    leg: Leg,
+    active: Array,
+) -> tuple[Flight, Array]:
+    """A leg with its event known, from the scene's state to where the event has led; and begin of contact [s] after it."""
     held, faces = start_leg(scene, surfaces, leg.mode, leg_start)
     verdict = leg.verdict
     ends = active & (verdict.bounces | verdict.stops)
     logged = jnp.where(leg.arrives, jnp.maximum(rest, shortest_duration(rest)), leg.duration)
     duration, end, guards = _find_moment(motion, held, faces, leg_start, logged, verdict.guard, ends)
-    meeting = meet_surface(faces, held.reaction, guards, verdict.guard, to_float_time(leg_start + duration), end)
+    end_time = leg_start + duration
+    meeting = meet_surface(faces, held.reaction, guards, verdict.guard, to_float_time(end_time), end)
     after = respond_to_event(meeting, verdict, end)
-    return Flight(scene.state, held, leg_start, duration, end, after, active)
+    rests = active & verdict.rests
+    delay = measure_last_flights(meeting, rests, held.acceleration(end_time, end))
+    since = jnp.where(meeting.chosen & rests[None], (to_float_time(end_time) + delay)[None], since)
+    return Flight(scene.state, held, leg_start, duration, end, after, active), since
 
 
 def _find_moment(

@@ -29,6 +29,7 @@ from physjax.physics.contacts.impact_response import (
     Verdict,
     judge_event,
     measure_guards,
+    measure_last_flights,
     meet_surface,
     respond_to_event,
     update_contact_starts,
@@ -36,7 +37,7 @@ from physjax.physics.contacts.impact_response import (
 from physjax.physics.contacts.legs import MAX_IMPACTS, Motion, choose_lanes, shortest_duration
 from physjax.physics.contacts.surfaces import Surfaces
 from physjax.scene import Scene
-from physjax.vectors import dot, norm
+from physjax.vectors import norm
 
 MAX_TRIES = 64
 """Turns that one event may take on average: bisection alone needs 52 in float64, the usual is three to five."""
@@ -249,9 +250,10 @@ def _refine(
     def resolve() -> tuple[Particles, Array, Verdict]:
         meeting = meet_surface(faces, held.reaction, guards, guard, to_float_time(impact_time), end)
         load = held.acceleration(impact_time, end)
-        verdict, flights = judge_event(meeting, guard, reached, load, held.state, end, dt)
+        verdict = judge_event(meeting, guard, reached, load, held.state, end, dt)
         state = respond_to_event(meeting, verdict, end)
-        rest_time, load_speed = to_float_time(impact_time) + flights, jnp.sqrt(dot(load, load)) * dt
+        rest_time = to_float_time(impact_time) + measure_last_flights(meeting, verdict.rests, load)
+        load_speed = norm(load) * dt
         return state, update_contact_starts(now.since, meeting, verdict, rest_time, state, load_speed), verdict
 
     state, since, verdict = materialise_where(found, resolve)

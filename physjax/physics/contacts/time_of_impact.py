@@ -117,15 +117,16 @@ def _find_end(motion, changing, meets, scene, surfaces, t, dt):
 
 
 def _log_end(motion, changing, meets, scene, surfaces, t, dt):
-    """The same, and what the replay needs to know."""
+    """The same, and a record for the replay."""
     progress, legs = log_events(motion, scene, surfaces, t, dt, meets)
     return _finish(changing, meets, scene, surfaces, t, dt, progress), (progress.legs, legs)
 
 
 def _replay_end(flown, motion, changing, meets, scene, surfaces, t, dt):
-    """The state after the step, differentiable, and what comes of the memory: nothing that could be differentiated."""
-    state, _ = replay_step(motion, scene, surfaces, t, dt, flown, lambda nothing, _: nothing, ())
-    return choose_lanes(meets, state, changing[0])
+    """The same by a replay, differentiable; zero instead of infinite where there is no contact."""
+    state, since, _ = replay_step(motion, scene, surfaces, t, dt, flown, lambda nothing, _: nothing, ())
+    since = jnp.where(meets[None], since, changing[1])
+    return choose_lanes(meets, state, changing[0]), jnp.where(jnp.isfinite(since), since, 0.0)
 
 
 def _finish(changing, meets, scene, surfaces, t, dt, progress) -> tuple[Particles, Array]:
@@ -153,7 +154,7 @@ def fold_flights(
     active = jnp.ones(dt.shape, bool)
     progress, legs = log_events(motion, scene, surfaces, t, dt, active)
     flown = progress.legs, legs
-    _, total = replay_step(motion, scene, surfaces, t, dt, flown, add, total)
+    *_, total = replay_step(motion, scene, surfaces, t, dt, flown, add, total)
     return total, progress.state
 
 
