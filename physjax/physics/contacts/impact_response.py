@@ -69,6 +69,12 @@ def measure_guards(faces: Surfaces, reaction: Reaction, t: ArrayLike, state: Par
     return distance if slide is None else jnp.concatenate([distance, slide])
 
 
+def select_guard(guards: Array, guard: Array) -> Array:
+    """The value of the guard with this number, lane by lane."""
+    own = guard[None] == jnp.arange(len(guards), dtype=guard.dtype).reshape(-1, *(1,) * guard.ndim)
+    return jnp.sum(jnp.where(own, guards, 0.0), axis=0)
+
+
 def meet_surface(
     faces: Surfaces, reaction: Reaction, guards: Array, guard: Array, t: ArrayLike, at: Particles
 ) -> Meeting:

@@ -23,6 +23,7 @@ from physjax.physics.contacts.impact_response import (
     measure_last_flights,
     meet_surface,
     respond_to_event,
+    select_guard,
 )
 from physjax.physics.contacts.legs import MAX_IMPACTS, Flight, Motion, choose_lanes, shortest_duration
 from physjax.physics.contacts.search import Leg, Progress, find_events
@@ -42,9 +43,9 @@ def log_events(
     motion, scene, surfaces, t, dt = lax.stop_gradient((motion, scene, surfaces, t, dt))
     none = jnp.zeros(dt.shape, bool)
     verdict = Verdict(jnp.zeros(dt.shape, jnp.int32), none, none, none)
-    blank = Leg(jnp.zeros_like(dt), make_free_mode(scene, surfaces), verdict, none)
+    blank = Leg(jnp.zeros_like(dt), make_free_mode(scene, surfaces), verdict, none, jnp.zeros_like(dt))
     empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (MAX_IMPACTS + 1, *leaf.shape)), blank)
-    return find_events(motion, scene, surfaces, t, dt, active, _log_leg, empty)
+    return find_events(motion, scene, surfaces, t, dt, active, _log_leg, empty, slopes=True)
 
 
 def _log_leg(legs: Leg, ends: Array, number: Array, leg: Leg) -> Leg:
@@ -60,6 +61,7 @@ def _log_leg(legs: Leg, ends: Array, number: Array, leg: Leg) -> Leg:
         ContactMode(pressed, by_lane(legs.mode.still, leg.mode.still), slip),
         Verdict(*map(by_lane, legs.verdict, leg.verdict)),
         by_lane(legs.arrives, leg.arrives),
+        by_lane(legs.slope, leg.slope),
     )
 
 
@@ -110,9 +112,11 @@ def _fly_leg(
     """A leg with its event known, from the scene's state to where the event has led; and begin of contact [s] after it."""
     held, faces = start_leg(scene, surfaces, leg.mode, leg_start)
     verdict = leg.verdict
-    ends = active & (verdict.bounces | verdict.stops)
     logged = jnp.where(leg.arrives, jnp.maximum(rest, shortest_duration(rest)), leg.duration)
-    duration, end, guards = _find_moment(motion, held, faces, leg_start, logged, verdict.guard, ends)
+    ends = active & (verdict.bounces | verdict.stops) & (leg.slope < 0)
+    duration, end, guards = _find_moment(
+        motion, held, faces, leg_start, logged, jnp.where(ends, leg.slope, -jnp.inf), verdict.guard
+    )
     end_time = leg_start + duration
     meeting = meet_surface(faces, held.reaction, guards, verdict.guard, to_float_time(end_time), end)
     after = respond_to_event(meeting, verdict, end)
@@ -123,26 +127,27 @@ def _fly_leg(
 
 
 def _find_moment(
-    motion: Motion, held: Scene, faces: Surfaces, leg_start: Time, logged: Array, guard: Array, ends: Array
+    motion: Motion, held: Scene, faces: Surfaces, leg_start: Time, logged: Array, slope: Array, guard: Array
 ) -> tuple[Array, Particles, Array]:
-    """The duration of a leg [s] with its derivatives, and the state and the guards after it."""
+    """The duration of a leg [s] with its derivatives, and the state and the guards after it.
 
-    def move(duration: Array) -> tuple[Array, tuple[Particles, Array]]:
+    The slope of the guard that ends it is infinite where nothing does.
+    """
+
+    def move(duration: Array) -> tuple[Particles, Array]:
         end = motion(held, leg_start, duration).state
-        guards = measure_guards(faces, held.reaction, to_float_time(leg_start + duration), end)
-        own = guard[None] == jnp.arange(len(guards), dtype=guard.dtype).reshape(-1, *(1,) * guard.ndim)
-        return jnp.sum(jnp.where(own, guards, 0.0), axis=0), (end, guards)
+        return end, measure_guards(faces, held.reaction, to_float_time(leg_start + duration), end)
 
     def improve(carry: tuple, last: Array) -> tuple[tuple, None]:
         def move_again() -> tuple:
-            duration = carry[0]
-            value, slope, there = jax.jvp(move, (duration,), (jnp.ones_like(duration),), has_aux=True)
-            value, slope = value - lax.stop_gradient(value), lax.stop_gradient(slope)
-            falls = ends & (slope < 0) & ~last
-            return duration - jnp.where(falls, value, 0.0) / jnp.where(falls, slope, 1.0), *there
+            end, guards = move(carry[0])
+            value = select_guard(guards, guard)
+            # only derivatives move the moment, and not those of the last pass
+            change = (value - lax.stop_gradient(value)) / slope
+            return carry[0] - jnp.where(last, 0.0, change), end, guards
 
-        return lax.cond(last | any_lane(ends), move_again, lambda: carry), None
+        return lax.cond(last | any_lane(jnp.isfinite(slope)), move_again, lambda: carry), None
 
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(move, logged)[1])
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(move, logged))
     last = jnp.arange(ORDERS + 1) == ORDERS
     return lax.scan(improve, (logged, *blank), last)[0]

@@ -51,7 +51,9 @@ class Reaction(eqx.Module):
         if turn is not None:
             wanted = wanted - self._take_places(turn)
         force = _solve_normal_forces(normal, along, wanted, self.pressed)
-        acceleration = acceleration + (scale(force[0], along[0]) if len(force) == 1 else jnp.sum(scale(force, along), 0))
+        acceleration = acceleration + (
+            scale(force[0], along[0]) if len(force) == 1 else jnp.sum(scale(force, along), 0)
+        )
         # a product and not a choice: `where` between vectors costs several times the step
         return scale(1 - self.still, acceleration)
 

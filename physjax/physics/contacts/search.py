@@ -32,6 +32,7 @@ from physjax.physics.contacts.impact_response import (
     measure_last_flights,
     meet_surface,
     respond_to_event,
+    select_guard,
     update_contact_starts,
 )
 from physjax.physics.contacts.legs import MAX_IMPACTS, Motion, choose_lanes, shortest_duration
@@ -71,12 +72,17 @@ class Bracket(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """How a leg was flown: for how long [s], in which contact mode, what ended it, and whether that was the step's end."""
+    """How a leg was flown: for how long [s], in which contact mode, what ended it, and whether that was the step's end.
+
+    `slope` [1/s] is the derivative of the guard that ended it by the duration, along the method's own step; zero where it
+    is not asked for.
+    """
 
     duration: Array
     mode: ContactMode
     verdict: Verdict
     arrives: Bool[Array, "*lanes"]
+    slope: Array
 
 
 class Progress(NamedTuple):
@@ -111,11 +117,13 @@ def find_events(
     active: Array,
     log: Callable[[Tree, Array, Array, Leg], Tree],
     logged: Tree,
+    *,
+    slopes: bool = False,
 ) -> tuple[Progress, Tree]:
     """The step of lanes that are active, from event to event, at most `MAX_IMPACTS` of them.
 
     Each leg that ends is handed to `log(logged, ends, number, leg)`, with the lanes in which it ends and how many legs
-    they have flown before.
+    they have flown before; with the slopes of the guards if these are asked for.
     """
     start = start_progress(scene, surfaces, dt, active)
 
@@ -124,7 +132,7 @@ def find_events(
 
     def advance(carry: tuple[Progress, Tree]) -> tuple[Progress, Tree]:
         before, logged = carry
-        after, leg = _advance(motion, scene, surfaces, t, dt, before)
+        after, leg = _advance(motion, scene, surfaces, t, dt, before, slopes)
         return after, log(logged, after.legs > before.legs, before.legs, leg)
 
     return bounded_while_loop(going, advance, (start, logged), most=MAX_TRIES * (MAX_IMPACTS + 1))
@@ -135,7 +143,7 @@ def _is_under_way(progress: Progress) -> Array:
 
 
 def _advance(
-    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, now: Progress
+    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, now: Progress, slopes: bool
 ) -> tuple[Progress, Leg]:
     """A turn of every lane that is under way: it moves once, for the duration that it proposes."""
     going, refining = _is_under_way(now), now.bracket.refining
@@ -179,7 +187,25 @@ def _advance(
         return _refine(held, faces, refining & going, leg_start, duration, end, dt, at_end)
 
     after, verdict = lax.cond(any_lane(refining & going), refine, lambda: quiet)
-    return after, Leg(duration, mode, verdict, arrives)
+    slope = jnp.zeros_like(dt)
+    if slopes:
+        found = verdict.bounces | verdict.stops
+        slope = materialise_where(
+            found, lambda: _measure_slope(motion, held, faces, leg_start, duration, verdict.guard)
+        )
+    return after, Leg(duration, mode, verdict, arrives, slope)
+
+
+def _measure_slope(
+    motion: Motion, held: Scene, faces: Surfaces, leg_start: Time, duration: Array, guard: Array
+) -> Array:
+    """The derivative of a guard by the duration of the leg [1/s], along the method's own step."""
+
+    def follow(duration: Array) -> Array:
+        end = motion(held, leg_start, duration).state
+        return select_guard(measure_guards(faces, held.reaction, to_float_time(leg_start + duration), end), guard)
+
+    return jax.jvp(follow, (duration,), (jnp.ones_like(duration),))[1]
 
 
 def _begin_bracket(
@@ -194,9 +220,7 @@ def _begin_bracket(
 ) -> Bracket:
     """The brackets of the lanes that tried the rest of their step and have an event on the way."""
     start = held.state
-    event = materialise_where(
-        tries, lambda: find_next_event(faces, held.reaction, mode.pressed, start, end, t, rest)
-    )
+    event = materialise_where(tries, lambda: find_next_event(faces, held.reaction, mode.pressed, start, end, t, rest))
     hit = tries & event.hit
     if held.held is not None:
         hit = hit & ~held.held
@@ -279,7 +303,7 @@ def _close_bracket(bracket: Bracket, value: Array) -> Bracket:
     secant = (value - bracket.value) / jnp.where(step == 0, jnp.nan, step)
     slope = jnp.where(secant < 0, secant, bracket.slope)
     target = tried - value / jnp.where(slope < 0, slope, -jnp.inf)
-    safe = (target > low) & (target < high) & ((jnp.abs(value) <= 0.5 * jnp.abs(bracket.value)))
+    safe = (target > low) & (target < high) & (jnp.abs(value) <= 0.5 * jnp.abs(bracket.value))
     return bracket._replace(
         low=low,
         high=high,

@@ -75,14 +75,11 @@ def _lanes_last(changing: tuple[Particles, Array]) -> tuple[Particles, Array]:
     return changing[0], jnp.moveaxis(changing[1], -1, 0)
 
 
-def _step_in_contact(
-    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array
-) -> tuple[Particles, Array]:
+def _step_in_contact(motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array) -> tuple[Particles, Array]:
     """A whole step of all lanes, as if nothing were met on the way; surfaces carry those that are in contact."""
     since = surfaces.touching_since
     # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
     touches = jnp.any(jnp.isfinite(since), axis=0) & scene.finite(scene.state)
-
 
     def decide() -> ContactMode:
         time = to_float_time(t)
