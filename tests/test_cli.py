@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from physjax.cli import main
-from physjax.scenes import FAILURES, SCENES
 from physjax.stepping.methods import METHODS
 
 
@@ -54,14 +53,6 @@ def test_scenes_lists_what_a_scene_is_its_size_and_its_truth(capsys):
     assert "kepler: 2 " in printed
     assert "truth: closed form" in printed
     assert "hanging_rope: " in printed
-
-
-@pytest.mark.slow
-def test_scenes_lists_the_gallery(capsys):
-    assert main(["scenes"]) == 0
-    printed = capsys.readouterr().out
-    for name in (*SCENES, *FAILURES):
-        assert name in printed
 
 
 def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
