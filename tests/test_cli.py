@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from physjax.cli import main
+from physjax.cli.chart import _choose_scenes
 from physjax.stepping.methods import METHODS
 
 
@@ -19,6 +20,7 @@ def test_chart_writes_picture_csv_and_page(tmp_path, capsys):
     assert "semi_implicit_euler" in page
     assert "<img" in page
     printed = capsys.readouterr().out
+    assert f"Chart: {folder / 'projectile.png'}" in printed
     assert "error 1e-04" in printed
     assert "closed form" in printed
     assert "jax" in printed
@@ -31,6 +33,20 @@ def test_chart_of_a_scene_with_contacts_shows_both_treatments(tmp_path, monkeypa
     page = (tmp_path / "index.html").read_text()
     assert "verlet, projected" in page
     assert "diffrax Tsit5" not in page
+
+
+def test_chart_has_a_few_scenes_by_default_and_all_smooth_ones_when_asked():
+    """The default tells the story in two minutes; what is smooth is known without building a scene."""
+    few, smooth = _choose_scenes([], False), _choose_scenes([], True)
+    assert few == ["fall_with_drag", "oscillator", "kepler", "bouncing_ball"]
+    assert set(few) < set(smooth)
+    assert {"flag", "t_handle", "solar_system"} < set(smooth)
+    assert not {"tennis_ball", "fountain", "breaking_bridge", "car"} & set(smooth)
+
+
+def test_chart_takes_names_or_all(capsys):
+    assert main(["chart", "kepler", "--all"]) == 2
+    assert "expected no names" in capsys.readouterr().err
 
 
 def test_unknown_scene_names_the_nearest(tmp_path, capsys):

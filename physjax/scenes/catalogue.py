@@ -45,7 +45,7 @@ class Entry(NamedTuple):
 def list_scene(name: str) -> Entry:
     """The entry of a scene: from the table, or, for one that is not of this package, from the scene itself."""
     known = _read_entries().get(name)
-    ours = SCENES[name].__module__.startswith(f"{__package__}.")
+    ours = SCENES[name].__module__.startswith("physjax.scenes.")
     return known if known is not None and ours else describe_problem(name, build_scene(name))
 
 
@@ -67,9 +67,8 @@ def describe_problem(name: str, problem: Problem) -> Entry:
 @functools.cache
 def _read_entries() -> dict[str, Entry]:
     """The entries of the table by name; titles are the docstrings'."""
-    path = resources.files(__package__) / "data" / TABLE
-    with path.open(encoding="utf-8", newline="") as lines:
-        rows = [row for row in csv.DictReader(lines) if row["name"] in SCENES]
+    lines = (resources.files("physjax.scenes") / "data" / TABLE).read_text(encoding="utf-8").splitlines()
+    rows = [row for row in csv.DictReader(lines) if row["name"] in SCENES]
     return {
         row["name"]: Entry(row["name"], title(row["name"]), row["size"], row["truth"], row["smooth"] == "yes")
         for row in rows
