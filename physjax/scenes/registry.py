@@ -1,9 +1,10 @@
 """The registry of scenes and failures, filled by their decorators from any file of this folder."""
 
+import functools
 import inspect
 from collections.abc import Callable
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,8 +29,13 @@ def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
         >>> scenes.title("drop"), scenes.SCENES.pop("drop") is drop
         ('A ball that falls.', True)
     """
-    SCENES[build.__name__] = build
-    return build
+
+    @functools.wraps(build)
+    def build_named(*arguments: Any, **numbers: Any) -> Problem:
+        return build(*arguments, **numbers)._replace(name=build.__name__)
+
+    SCENES[build.__name__] = build_named
+    return build_named
 
 
 def failure(build: Callable[..., "Failure"]) -> Callable[..., "Failure"]:
