@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -160,14 +161,16 @@ def cache(folder: str | os.PathLike[str] | None) -> Path | None:
     """Keep every program that is compiled from now on in a folder, and read it from there in later sessions.
 
     Returns the folder inside that is this machine's own: programs belong to a version of jaxlib and to the features of
-    a CPU, so that none is read where it was not made for. None puts things back as they were. Nothing is kept unless
-    this is called. A program read runs as fast as one compiled, but is traced before it can be looked up: on two cores
-    the first run of three tumbling boxes takes 2.2 s instead of 9.4 with jax 0.12, and 4.9 instead of 13.5 with 0.10.1.
+    a CPU, so that none is read where it was not made for. A folder that exists and cannot be written is only read, with
+    a warning if it holds nothing for this machine. None puts things back as they were. Nothing is kept unless this is
+    called, and nothing is ever deleted: remove the folder when it is too large (some 20 kB a program).
 
-    jax 0.10 prints two lines on "cpu_aot_loader" for each program that it reads, about features of its own (a preference
-    against gather and scatter) that no CPU has, and reads it all the same; the environment variable
-    `TF_CPP_MIN_LOG_LEVEL=3`, set before Python starts, keeps them quiet. Who can write into the folder can make whoever
-    reads it run anything: give a class one that only you can write into.
+    A program read runs as fast as one compiled, but is traced all the same before it can be looked up. On two cores the
+    first run of three tumbling boxes takes 2.2 s of processor time instead of 9.4 with jax 0.12, 4.9 instead of 13.5
+    with 0.10.1. That one prints two lines on "cpu_aot_loader" for each program that it reads, about preferences of the
+    compiler that no CPU lists among its features, and reads it all the same; the environment variable
+    `TF_CPP_MIN_LOG_LEVEL=3`, set before Python starts, keeps it quiet. Who can write into the folder can make those who
+    read it run anything: a class reads one that only its teacher writes.
 
     Example:
         >>> import pathlib, tempfile
@@ -176,20 +179,46 @@ def cache(folder: str | os.PathLike[str] | None) -> Path | None:
         ...     own.parent == pathlib.Path(folder), cache(None)
         (True, None)
     """
-    if folder is None:
-        for name, value in _SETTINGS_BEFORE.items():
-            jax.config.update(name, value)
-        _SETTINGS_BEFORE.clear()
-        own = None
-    else:
-        own = ensure_writable_folder(Path(folder) / name_compiler_target())
-        for name, value in (("jax_compilation_cache_dir", str(own)), *_KEEP_ALL.items()):
-            _SETTINGS_BEFORE.setdefault(name, getattr(jax.config, name))
-            jax.config.update(name, value)
+    own = None
+    _restore_settings()
+    if folder is not None:
+        own = Path(folder) / name_compiler_target()
+        nearest = own if own.is_dir() else Path(folder)
+        if nearest.is_dir() and not os.access(nearest, os.W_OK):
+            _read_only(own)
+        else:
+            _change_settings(str(ensure_writable_folder(own)), least_seconds=0.0)
     compilation_cache.reset_cache()  # jax looks for the folder once, at the first program
     return own
 
 
-_KEEP_ALL = {"jax_persistent_cache_min_compile_time_secs": 0.0, "jax_persistent_cache_min_entry_size_bytes": -1}
-"""A scene is built by hundreds of small programs, which jax would not keep: they take as long as the large ones."""
-_SETTINGS_BEFORE: dict[str, object] = {}
+def _read_only(own: Path) -> None:
+    """Read from a folder and write nothing into it, if it is there."""
+    if own.is_dir():
+        _change_settings(str(own), least_seconds=FOREVER_SECONDS)
+    else:
+        words = f"cache: {own} does not exist and cannot be written, so programs are compiled. Run physjax warm as its owner."
+        warnings.warn(words, stacklevel=3)
+
+
+def _change_settings(folder: str, *, least_seconds: float) -> None:
+    """Have jax read from a folder, and write what takes this long to compile, however small."""
+    for name, value in zip(SETTINGS, (folder, least_seconds, -1), strict=True):
+        _settings_before[name] = getattr(jax.config, name)
+        jax.config.update(name, value)
+
+
+def _restore_settings() -> None:
+    while _settings_before:
+        jax.config.update(*_settings_before.popitem())
+
+
+SETTINGS = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
+"""Of jax, in this order. By itself it keeps no small programs; a scene is built by hundreds, as slow together as a large one."""
+FOREVER_SECONDS = 1e9
+"""No program takes this long to compile, so none is written."""
+_settings_before: dict[str, object] = {}

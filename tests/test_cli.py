@@ -3,9 +3,11 @@
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
+from physjax.backend import name_compiler_target
 from physjax.cli import main
 from physjax.cli.chart import _choose_scenes
 from physjax.stepping.methods import METHODS
@@ -145,3 +147,32 @@ def test_sweep_refuses_in_plain_words(tmp_path, capsys, over, outcome, words):
     command = ["sweep", "hanging_rope", "--over", over, "--outcome", outcome, "--out", str(tmp_path)]
     assert main(command) == 2
     assert words in capsys.readouterr().err
+
+
+def test_a_command_keeps_its_programs_where_it_is_told(tmp_path, capsys):
+    before = jax.config.jax_compilation_cache_dir
+    assert main(["scenes", "--only", "kepler", "--cache", str(tmp_path / "compiled")]) == 0
+    assert [folder.name for folder in (tmp_path / "compiled").iterdir()] == [name_compiler_target()]
+    assert jax.config.jax_compilation_cache_dir == before
+    assert main(["warm", "keppler", "--cache", str(tmp_path)]) == 2
+    assert "Did you mean kepler" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_class_compiles_nothing_that_its_teacher_has_warmed(tmp_path):
+    compiled = str(tmp_path / "compiled")
+    warm = [sys.executable, "-m", "physjax", "warm", "projectile", "--cache", compiled]
+    run = subprocess.run(warm, capture_output=True, text=True, check=True)
+    assert f"physjax chart --cache {compiled}" in run.stdout
+    lesson = f"""
+import jax, sys
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
+from physjax.cli import main
+main(["chart", "projectile", "--quick", "--cache", {compiled!r}, "--out", {str(tmp_path / "chart")!r}])
+print(events.count("cache_hits"), events.count("cache_misses"))
+"""
+    run = subprocess.run([sys.executable, "-c", lesson], capture_output=True, text=True, check=True)
+    hits, misses = map(int, run.stdout.split()[-2:])
+    assert hits > 20
+    assert misses == 0

@@ -1,6 +1,7 @@
 """While a program compiles, one line says so where somebody watches; and compiled programs are kept where it is asked for."""
 
 import io
+import os
 import re
 import sys
 import time
@@ -222,6 +223,20 @@ def test_each_compiler_and_each_cpu_has_a_folder_of_its_own(monkeypatch):
     assert backend.name_compiler_target() != here
     monkeypatch.setattr(backend, "version", lambda package: "0.9.9")
     assert backend.name_compiler_target().startswith("jaxlib-0.9.9-")
+
+
+@pytest.mark.usefixtures("uncached")
+def test_a_folder_that_others_own_is_read_and_not_written(tmp_path, monkeypatch):
+    own = cache(tmp_path)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write everywhere
+    assert cache(tmp_path) == own
+    assert jax.config.jax_compilation_cache_dir == str(own)
+    jax.jit(lambda x: x * 5.0 + 1.0)(2.0)
+    assert not list(own.iterdir())
+    own.rmdir()
+    with pytest.warns(UserWarning, match="programs are compiled"):
+        cache(tmp_path)
+    assert jax.config.jax_compilation_cache_dir != str(own)
 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path):
