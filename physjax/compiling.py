@@ -143,8 +143,12 @@ def is_compiling(thread: int) -> bool:
 
 def _find_screen() -> Screen | None:
     """Where somebody reads what is written now: a terminal, or a notebook, whose standard error is red; else None."""
-    if "ipykernel" in sys.modules:
-        return sys.stdout
+    ipython = sys.modules.get("IPython")
+    kernel = None if ipython is None else getattr(ipython.get_ipython(), "kernel", None)
+    if kernel is not None:
+        # who runs a notebook as a file, for its output, answers no questions
+        answers = kernel.get_parent().get("content", {}).get("allow_stdin", False)
+        return sys.stdout if answers else None
     return sys.stderr if sys.stderr is not None and sys.stderr.isatty() else None
 
 

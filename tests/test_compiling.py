@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 import tqdm
+from jupyter_client.manager import start_new_kernel
 
 import physjax
 from physjax import Particles, Scene, backend, cache, compiling, forces, methods, simulate
@@ -161,12 +162,37 @@ def test_a_progress_bar_is_left_alone(screen, session):
     assert screen.getvalue() == ""
 
 
-def test_a_notebook_shows_it_with_what_is_printed(session):
-    session.modules["ipykernel"] = "loaded"
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_notebook_shows_it_with_what_is_printed_unless_it_is_run_as_a_file(session, answers):
+    kernel = SimpleNamespace(get_parent=lambda: {"content": {"allow_stdin": answers}})
+    session.modules["IPython"] = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=kernel))
     with announce_compiling("car"):
-        compile_until(session.stdout.getvalue)
-    assert "compiling car" in session.stdout.getvalue()
+        compile_until(session.stdout.getvalue) if answers else compile_for(0.2)
+    assert ("compiling car" in session.stdout.getvalue()) == answers
     assert session.stderr.getvalue() == ""
+
+
+@pytest.mark.slow
+def test_a_kernel_is_asked_in_its_own_words():
+    code = """
+import jax, time
+from physjax import compiling
+with compiling.announce_compiling("car"):
+    jax.jit(lambda x: time.sleep(2.5) or x)(1.0)
+"""
+    manager, client = start_new_kernel(
+        kernel_name="python3", env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    )
+    try:
+        for answers in (True, False):
+            written = []
+            hook = lambda message: written.append(message["content"])  # noqa: B023, E731
+            reply = client.execute_interactive(code, allow_stdin=answers, output_hook=hook, timeout=60)
+            assert reply["content"]["status"] == "ok"
+            assert ("compiling car: 2 s so far" in str(written)) == answers
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
 
 
 def test_a_run_is_announced_when_it_compiles_and_not_when_it_is_run_again(screen):

@@ -72,7 +72,7 @@ def test_what_the_list_says_of_each_scene_is_so(name):
 
 def test_the_gallery_is_listed_without_building_a_scene(monkeypatch, capsys):
     for name, build in SCENES.items():
-        unbuildable = functools.wraps(build)(lambda: pytest.fail("built to be listed"))
+        unbuildable = functools.wraps(build)(lambda: pytest.fail("not in the table: run write_table()"))
         monkeypatch.setitem(SCENES, name, unbuildable)
     assert main(["scenes"]) == 0
     printed = capsys.readouterr().out

@@ -43,6 +43,8 @@ ROUNDING_ERRORS = {"float64": 1e-7, "float32": 1e-3}
 """Errors below which refinements that bring nothing are put down to rounding, relative to the path."""
 STALLED_ERROR_RATIO = 0.9
 """A refinement that leaves more than this share of the error has brought nothing."""
+LONGEST_TIMING = 4.0
+"""Time for all repeats of a run, in those that its budget allows to one."""
 EVALUATIONS_PER_TRIED_STEP = 3
 """Steps of the method inside an adaptive one for each that it tries: one whole and two halves."""
 
@@ -109,8 +111,10 @@ class Comparison(NamedTuple):
 
     def measure_times(self, run: Callable[[], Result]) -> tuple[Result, Times]:
         """What a run returns, and its least and median time [s]."""
-        # one that takes twice its budget is the last of its method: it need not be timed well
-        result, timing = time_repeatedly(run, self.budget.repeats, longest=2 * self.budget.seconds)
+        # one that takes twice its budget is the last of its method: it need not be timed well; and the longer a run is, the
+        # less a moment disturbs it, and the fewer repeats it needs
+        seconds = self.budget.seconds
+        result, timing = time_repeatedly(run, self.budget.repeats, longest=2 * seconds, total=LONGEST_TIMING * seconds)
         return result, {"seconds": timing.least, "seconds_median": timing.median}
 
     def is_fine_enough(self, runs: Sequence[Run]) -> bool:
