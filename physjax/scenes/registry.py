@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physjax.compiling import announce_compiling
 from physjax.study.problem import Problem
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ FAILURES: dict[str, Callable[..., "Failure"]] = {}
 def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
     """Register a function that builds a problem under its own name; the first line of its docstring is its title.
 
+    The problem bears that name, which is shown while it compiles.
+
     Example:
         >>> @scenes.scene
         ... def drop():
@@ -32,7 +35,8 @@ def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
 
     @functools.wraps(build)
     def build_named(*arguments: Any, **numbers: Any) -> Problem:
-        return build(*arguments, **numbers)._replace(name=build.__name__)
+        with announce_compiling(build.__name__):
+            return build(*arguments, **numbers)._replace(name=build.__name__)
 
     SCENES[build.__name__] = build_named
     return build_named
