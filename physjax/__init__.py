@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING
 
 from physjax import physics, stepping
 from physjax.checks import quantity
+from physjax.compiling import cache
 from physjax.particles import Particles
 from physjax.parts import Contact, Field, Force
 from physjax.physics import forces
@@ -72,6 +73,7 @@ __all__ = [
     "accuracy",
     "aim_at",
     "animate",
+    "cache",
     "contacts",
     "emitters",
     "energy",

@@ -8,16 +8,20 @@ Each policy has its reason and its measurement next to it. CPU figures are of tw
 - Which lanes are computed: `compact_and_apply`, `compact_and_apply_runs`.
 - How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `SOURCES_PER_TILE`.
 - What the compiler is asked for: `jit_untransformed`.
+- What its programs depend on: `name_compiler_target`.
 - Which clock a search goes by, and how a device is called: `read_work_clock`, `device_kind`, `describe_device`.
 """
 
 import functools
+import hashlib
 import math
 import platform
 import time
 import warnings
 from collections.abc import Callable
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -350,3 +354,27 @@ def _is_known_option(name: str, value: int | bool) -> bool:
         )
         return False
     return True
+
+
+# what compiled programs depend on
+
+
+def name_compiler_target() -> str:
+    """What compiled programs depend on, as the name of a folder: jaxlib's version, and the kind and features of the CPU.
+
+    JAX tells the devices of its cache apart by their kind alone, and code for one CPU stops another that lacks an
+    instruction.
+    """
+    features = hashlib.sha256(_read_cpu_features().encode()).hexdigest()[:12]
+    return f"jaxlib-{version('jaxlib')}-{platform.machine()}-{features}"
+
+
+def _read_cpu_features() -> str:
+    """The model and instruction sets of the first CPU, where Linux lists them; elsewhere the name that the system gives it."""
+    listed = Path("/proc/cpuinfo")
+    if not listed.exists():
+        return platform.processor()
+    first = listed.read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
+    return "\n".join(
+        line for line in first if line.split(":")[0].strip() in ("model name", "flags", "Features", "CPU part")
+    )

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from physjax.backend import any_lane
 from physjax.checks import Numbers, quantity
 from physjax.closures import warn_of_recompilation
+from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
 from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
 from physjax.particles import demand_particles
@@ -60,6 +61,7 @@ class Distanced(Protocol):
 
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
+@announce_compiling("the crossing")
 def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> Crossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
     demand_particles("crossing", run.scene.state, "for bodies, record the signed distance instead")

@@ -3,11 +3,13 @@
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
+from physjax.backend import name_compiler_target
 from physjax.cli import main
-from physjax.scenes import FAILURES, SCENES
+from physjax.cli.chart import _choose_scenes
 from physjax.stepping.methods import METHODS
 
 
@@ -20,6 +22,7 @@ def test_chart_writes_picture_csv_and_page(tmp_path, capsys):
     assert "semi_implicit_euler" in page
     assert "<img" in page
     printed = capsys.readouterr().out
+    assert f"Chart: {folder / 'projectile.png'}" in printed
     assert "error 1e-04" in printed
     assert "closed form" in printed
     assert "jax" in printed
@@ -32,6 +35,20 @@ def test_chart_of_a_scene_with_contacts_shows_both_treatments(tmp_path, monkeypa
     page = (tmp_path / "index.html").read_text()
     assert "verlet, projected" in page
     assert "diffrax Tsit5" not in page
+
+
+def test_chart_has_a_few_scenes_by_default_and_all_smooth_ones_when_asked():
+    """The default tells the story in two minutes; what is smooth is known without building a scene."""
+    few, smooth = _choose_scenes([], False), _choose_scenes([], True)
+    assert few == ["fall_with_drag", "oscillator", "kepler", "bouncing_ball"]
+    assert set(few) < set(smooth)
+    assert {"flag", "t_handle", "solar_system"} < set(smooth)
+    assert not {"tennis_ball", "fountain", "breaking_bridge", "car"} & set(smooth)
+
+
+def test_chart_takes_names_or_all(capsys):
+    assert main(["chart", "kepler", "--all"]) == 2
+    assert "expected no names" in capsys.readouterr().err
 
 
 def test_unknown_scene_names_the_nearest(tmp_path, capsys):
@@ -54,14 +71,6 @@ def test_scenes_lists_what_a_scene_is_its_size_and_its_truth(capsys):
     assert "kepler: 2 " in printed
     assert "truth: closed form" in printed
     assert "hanging_rope: " in printed
-
-
-@pytest.mark.slow
-def test_scenes_lists_the_gallery(capsys):
-    assert main(["scenes"]) == 0
-    printed = capsys.readouterr().out
-    for name in (*SCENES, *FAILURES):
-        assert name in printed
 
 
 def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
@@ -138,3 +147,32 @@ def test_sweep_refuses_in_plain_words(tmp_path, capsys, over, outcome, words):
     command = ["sweep", "hanging_rope", "--over", over, "--outcome", outcome, "--out", str(tmp_path)]
     assert main(command) == 2
     assert words in capsys.readouterr().err
+
+
+def test_a_command_keeps_its_programs_where_it_is_told(tmp_path, capsys):
+    before = jax.config.jax_compilation_cache_dir
+    assert main(["scenes", "--only", "kepler", "--cache", str(tmp_path / "compiled")]) == 0
+    assert [folder.name for folder in (tmp_path / "compiled").iterdir()] == [name_compiler_target()]
+    assert jax.config.jax_compilation_cache_dir == before
+    assert main(["warm", "keppler", "--cache", str(tmp_path)]) == 2
+    assert "Did you mean kepler" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_class_compiles_nothing_that_its_teacher_has_warmed(tmp_path):
+    compiled = str(tmp_path / "compiled")
+    warm = [sys.executable, "-m", "physjax", "warm", "projectile", "--cache", compiled]
+    run = subprocess.run(warm, capture_output=True, text=True, check=True)
+    assert f"physjax chart --cache {compiled}" in run.stdout
+    lesson = f"""
+import jax, sys
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
+from physjax.cli import main
+main(["chart", "projectile", "--quick", "--cache", {compiled!r}, "--out", {str(tmp_path / "chart")!r}])
+print(events.count("cache_hits"), events.count("cache_misses"))
+"""
+    run = subprocess.run([sys.executable, "-c", lesson], capture_output=True, text=True, check=True)
+    hits, misses = map(int, run.stdout.split()[-2:])
+    assert hits > 20
+    assert misses == 0

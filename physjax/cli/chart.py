@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 BOUNCING_SCENE = "bouncing_ball"
 """The scene that shows how contacts lower the order of a method."""
+DEFAULT_SCENES = ("fall_with_drag", "oscillator", "kepler", BOUNCING_SCENE)
+"""What is charted by default: free flight with drag, stiff and soft springs, a close approach, and contacts."""
 
 
 def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -22,8 +24,9 @@ def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         "scenes",
         nargs="*",
         metavar="SCENE",
-        help="names from `physjax scenes`; by default all smooth ones and a ball that bounces",
+        help=f"names from `physjax scenes`; by default {', '.join(DEFAULT_SCENES)}",
     )
+    command.add_argument("--all", action="store_true", help="all smooth scenes, and a ball that bounces")
     command.add_argument(
         "--out", default="chart", metavar="DIR", help="where pictures, CSV and the page go (default: chart)"
     )
@@ -33,41 +36,55 @@ def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         action="store_true",
         help="a page for each scene instead: accuracy, stability and energy, with coarse charts",
     )
-    command.set_defaults(run=lambda options: _run_chart(options.scenes, options.out, options.quick, options.report))
+    command.set_defaults(run=_run_chart)
 
 
-def _run_chart(names: list[str], out: str, quick: bool, whole: bool) -> None:
-    """Study scenes one by one: PNG, CSV, one HTML page and a printed table; with `whole` a report on each scene instead."""
+def _run_chart(options: argparse.Namespace) -> None:
+    """Study scenes one by one: PNG, CSV, one HTML page and a printed table; or a report on each scene instead."""
     import matplotlib
 
-    from physjax.checks import demand_known
-    from physjax.files import ensure_writable_folder, write_atomically
-    from physjax.scenes import SCENES
-    from physjax.study import report_page
+    from physjax.files import ensure_writable_folder
+    from physjax.text import describe_machine
 
-    names = [demand_known("scene", name, SCENES) for name in dict.fromkeys(names)] or _select_smooth_scenes()
-    folder = ensure_writable_folder(out)
+    names = _choose_scenes(options.scenes, options.all)
+    folder = ensure_writable_folder(options.out)
     matplotlib.use("Agg")
-    if whole:
+    if options.report:
         return _write_reports(names, folder)
-    results = [_study_scene(name, folder, quick) for name in names]
-    summary = _summarise([result for result, _ in results])
-    with write_atomically(folder / "index.html") as file:
-        file.write(
-            report_page.build_page("physjax: speed against accuracy", summary, [section for _, section in results])
-        )
+    results, summary = [], ""
+    for name in names:
+        results.append(_study_scene(name, folder, options.quick))
+        summary = _summarise([result for result, _ in results])
+        # so far, so that it can be read while the others are studied
+        _write_page(folder, summary, [section for _, section in results])
+        print(f"Chart: {folder / f'{name}.png'}", flush=True)
     print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
-    print(f"Measured on {report_page.describe_machine()}.\nCharts: {folder / 'index.html'}")
+    print(f"Measured on {describe_machine()}.\nCharts: {folder / 'index.html'}")
 
 
-def _select_smooth_scenes() -> list[str]:
-    """What is charted by default: scenes without contacts or memory, and `BOUNCING_SCENE`.
+def _choose_scenes(names: list[str], everything: bool) -> list[str]:
+    """The scenes that were named, or those of the default; with `everything` those without contacts or memory, and a ball.
 
     The others are charted when they are named; all of them together would take an hour.
     """
+    from physjax.checks import demand_known
     from physjax.scenes import SCENES
+    from physjax.scenes.catalogue import list_scene
 
-    return [name for name, build in SCENES.items() if name == BOUNCING_SCENE or build().is_ode]
+    if everything and names:
+        raise ValueError(f"--all: got {names[0]} as well, expected no names with it.")
+    if everything:
+        return [name for name in SCENES if name == BOUNCING_SCENE or list_scene(name).smooth]
+    return [demand_known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(DEFAULT_SCENES)
+
+
+def _write_page(folder: Path, summary: str, sections: "list[Section]") -> None:
+    """The page with all charts, pictures inside."""
+    from physjax.files import write_atomically
+    from physjax.study.report_page import build_page
+
+    with write_atomically(folder / "index.html") as file:
+        file.write(build_page("physjax: speed against accuracy", summary, sections))
 
 
 def _write_reports(names: list[str], folder: Path) -> None:

@@ -20,14 +20,14 @@ def _run_scenes(names: list[str], out: str | None) -> int:
     """Print every scene, and every run that must fail; or draw the scenes. Returns 1 if one could not be drawn."""
     from physjax.checks import demand_known
     from physjax.scenes import FAILURES, SCENES, title
-    from physjax.scenes.catalogue import describe_scene
+    from physjax.scenes.catalogue import list_scene
     from physjax.text import format_table
 
     chosen = [demand_known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(SCENES)
     if out is not None:
         return _render_scenes(chosen, out)
     for name in chosen:
-        print(describe_scene(name)[0], end="\n\n", flush=True)
+        print(list_scene(name), end="\n\n", flush=True)
     if not names:
         print(format_table(["failure", "what it is"], [[name, title(name)] for name in FAILURES], align="<<"))
     return 0

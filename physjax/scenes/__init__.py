@@ -1,6 +1,7 @@
 """The gallery of scenes: each is one decorated function with its own truths; every file in this folder is imported.
 
-To add a scene, write a function that returns a `Problem` under `@scene`, in a file of this folder, old or new.
+To add a scene, write a function that returns a `Problem` under `@scene`, in a file of this folder, old or new, and let
+`catalogue.write_table()` note what `physjax scenes` says of it.
 """
 
 from importlib import import_module

@@ -1,7 +1,14 @@
-"""The gallery as a list and as a page: what each scene is, how large, what its results are tested against; its pictures."""
+"""The gallery as a list and as a page: what each scene is, how large, what its results are tested against; its pictures.
 
+What the list says of the scenes of this package stands in `data/gallery.csv`, so that nothing is built to be listed;
+`write_table()` writes it from the scenes, and a test holds it to them. A scene that is not in it is built.
+"""
+
+import csv
+import functools
 import html
 from collections.abc import Iterable, Iterator
+from importlib import resources
 from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
@@ -11,14 +18,21 @@ from physjax.physics.springs.springs import Springs
 from physjax.scenes.registry import SCENES, title
 from physjax.study.problem import Problem
 
+TABLE = "gallery.csv"
+"""What the list says of each scene, among the data of this folder."""
+
 
 class Entry(NamedTuple):
-    """A scene by name: its one-line description, its size, and the truths that it is tested against."""
+    """A scene by name: its title, its size, the truths that it is tested against, and whether it is smooth.
+
+    A smooth one is an ordinary differential equation: no contacts, no emitter, and no force that remembers.
+    """
 
     name: str
     title: str
     size: str
     truth: str
+    smooth: bool = True
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.size}", self.title, f"truth: {self.truth}"]
@@ -28,15 +42,49 @@ class Entry(NamedTuple):
         )
 
 
-def describe_scene(name: str) -> tuple[Entry, Problem]:
-    """The entry of a scene, and the scene itself, in float64."""
+def list_scene(name: str) -> Entry:
+    """The entry of a scene: from the table, or, for one that is not of this package, from the scene itself."""
+    known = _read_entries().get(name)
+    ours = SCENES[name].__module__.startswith("physjax.scenes.")
+    return known if known is not None and ours else describe_problem(name, build_scene(name))
+
+
+def build_scene(name: str) -> Problem:
+    """A scene of the gallery, in float64."""
     import jax
 
     with jax.enable_x64(True):
-        problem = SCENES[name]()
+        return SCENES[name]()
+
+
+def describe_problem(name: str, problem: Problem) -> Entry:
+    """The entry of a scene, from what has been built."""
     truths = [truth.statement for truth in problem.truths]
     known = ["closed form"] if problem.exact is not None else []
-    return Entry(name, title(name), _describe_size(problem), "; ".join(known + truths)), problem
+    return Entry(name, title(name), _describe_size(problem), "; ".join(known + truths), problem.is_ode)
+
+
+@functools.cache
+def _read_entries() -> dict[str, Entry]:
+    """The entries of the table by name; titles are the docstrings'."""
+    lines = (resources.files("physjax.scenes") / "data" / TABLE).read_text(encoding="utf-8").splitlines()
+    rows = [row for row in csv.DictReader(lines) if row["name"] in SCENES]
+    return {
+        row["name"]: Entry(row["name"], title(row["name"]), row["size"], row["truth"], row["smooth"] == "yes")
+        for row in rows
+    }
+
+
+def write_table(path: Path = Path(__file__).parent / "data" / TABLE) -> None:
+    """Write the table anew from the scenes themselves, after one was added or changed; half a minute."""
+    from physjax.files import write_atomically
+
+    with write_atomically(path) as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(["name", "size", "smooth", "truth"])
+        for name in SCENES:
+            entry = describe_problem(name, build_scene(name))
+            rows.writerow([name, entry.size, "yes" if entry.smooth else "no", entry.truth])
 
 
 def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception | None]]:
@@ -66,14 +114,14 @@ def _draw_scene(name: str, folder: Path) -> Entry:
     from physjax.files import write_atomically
     from physjax.show import auto_plot
 
-    record, problem = describe_scene(name)
+    problem = build_scene(name)
     run = problem.filmed()
     figure = auto_plot.plot_run(run, problem.looks)
     with write_atomically(folder / f"{name}.png", "wb") as file:
         figure.savefig(file, dpi=125, bbox_inches="tight")
     plt.close(figure)
     auto_plot.animate_run(run, problem.looks).save(folder / f"{name}.gif", progress=False)
-    return record
+    return describe_problem(name, problem)
 
 
 def _describe_size(problem: Problem) -> str:
@@ -90,7 +138,7 @@ def _describe_size(problem: Problem) -> str:
 
 
 def _render_card(record: Entry, drawn: bool = True) -> str:
-    name, line, size, truth = map(html.escape, record)
+    name, line, size, truth = map(html.escape, record[:4])
     picture = (
         f'<button aria-label="play or stop {name}"><img src="{name}.png" data-other="{name}.gif" alt="{line}" '
         'loading="lazy"></button>'

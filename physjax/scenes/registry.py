@@ -1,12 +1,14 @@
 """The registry of scenes and failures, filled by their decorators from any file of this folder."""
 
+import functools
 import inspect
 from collections.abc import Callable
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physjax.compiling import announce_compiling
 from physjax.study.problem import Problem
 
 if TYPE_CHECKING:
@@ -21,6 +23,8 @@ FAILURES: dict[str, Callable[..., "Failure"]] = {}
 def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
     """Register a function that builds a problem under its own name; the first line of its docstring is its title.
 
+    The problem bears that name, which is shown while it compiles.
+
     Example:
         >>> @scenes.scene
         ... def drop():
@@ -28,8 +32,14 @@ def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
         >>> scenes.title("drop"), scenes.SCENES.pop("drop") is drop
         ('A ball that falls.', True)
     """
-    SCENES[build.__name__] = build
-    return build
+
+    @functools.wraps(build)
+    def build_named(*arguments: Any, **numbers: Any) -> Problem:
+        with announce_compiling(build.__name__):
+            return build(*arguments, **numbers)._replace(name=build.__name__)
+
+    SCENES[build.__name__] = build_named
+    return build_named
 
 
 def failure(build: Callable[..., "Failure"]) -> Callable[..., "Failure"]:

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.checks import as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.scene import Scene
 from physjax.trajectory import Trajectory
 
@@ -54,6 +55,7 @@ def discontinuities(scene: Scene) -> Array:
     return jnp.sort(jnp.concatenate(times)) if times else jnp.zeros(0, scene.state.dtype)
 
 
+@announce_compiling("the reference")
 def reference(
     scene: Scene,
     times: ArrayLike | Sequence[float],

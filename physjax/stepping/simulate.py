@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from physjax.backend import MIN_LANES_TO_SELECT, jit_untransformed, split_compilation
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
+from physjax.compiling import announce_compiling
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
 from physjax.parts import as_module, find_plain_functions, holds_user_code
 from physjax.scene import Scene
@@ -31,6 +32,7 @@ from physjax.trajectory import Trajectory, select_stateful_parts
 
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
+@announce_compiling("the run")
 def simulate(
     scene: Scene,
     method: Callable,
@@ -197,6 +199,7 @@ class StateAfter(NamedTuple):
 
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
+@announce_compiling("the run")
 def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: ArrayLike) -> StateAfter:
     """The state after a `duration` [s] in equal steps of about `dt` [s]: the nearest count that fits, at least one.
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
+from physjax.compiling import announce_compiling
 from physjax.scene import Scene
 from physjax.stepping import methods
 from physjax.stepping.reference import cast_floats, reference
@@ -46,6 +47,7 @@ class Problem(NamedTuple):
     `exact(times)` is the closed form, NumPy float64 with a leading axis of times; None where there is none. `conserved`
     are quantities that the physics keeps constant. `frames` is the number of equally spaced moments at which errors are
     measured. `looks` is what it is drawn as, a lattice with faces or the shapes of bodies; by default what the scene holds.
+    `name` is that in the gallery.
     """
 
     scene: Scene
@@ -55,6 +57,7 @@ class Problem(NamedTuple):
     truths: tuple[Truth, ...] = ()
     frames: int = 32
     looks: "Look | None" = None
+    name: str = ""
 
     @property
     def times(self) -> np.ndarray:
@@ -73,9 +76,9 @@ class Problem(NamedTuple):
         break, is stepped by our own rk4 with `REFERENCE_STEPS_PER_FRAME` steps from each of the times to the next, contacts
         resolved as the scene has it; `parts` and `final_scene` then hold what is remembered.
         """
-        if self.is_ode:
-            return reference(self.scene, self.times, rtol=REFERENCE_TOLERANCE, atol=REFERENCE_TOLERANCE)
-        with jax.enable_x64(True):
+        with announce_compiling(self.name or "the reference"), jax.enable_x64(True):
+            if self.is_ode:
+                return reference(self.scene, self.times, rtol=REFERENCE_TOLERANCE, atol=REFERENCE_TOLERANCE)
             scene = cast_floats(self.scene, jnp.float64)
             steps = REFERENCE_STEPS_PER_FRAME * self.frames
             flight = simulate(
@@ -89,8 +92,8 @@ class Problem(NamedTuple):
 
     def verify(self) -> list[tuple[Truth, np.ndarray, bool]]:
         """Every truth with its measured value and whether it holds."""
-        flight = self.reference()
-        with jax.enable_x64(True):
+        with announce_compiling(self.name or "the reference"), jax.enable_x64(True):
+            flight = self.reference()
             measured = [np.asarray(truth.measure(flight)) for truth in self.truths]
         return [
             (truth, value, bool(np.all(np.abs(value - truth.expected) <= truth.tolerance)))

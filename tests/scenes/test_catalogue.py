@@ -1,13 +1,15 @@
 """The gallery is listed and drawn from what its scenes are, and a scene that fails stops none of the others."""
 
+import functools
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from physjax import Particles, Scene, forces, lattices
 from physjax.cli import main
-from physjax.scenes import SCENES
-from physjax.scenes.catalogue import describe_scene
+from physjax.scenes import FAILURES, SCENES
+from physjax.scenes.catalogue import build_scene, describe_problem, list_scene
 from physjax.study.problem import Problem, Truth
 
 
@@ -40,15 +42,41 @@ def gallery(monkeypatch):
 
 
 def test_a_scene_is_listed_with_its_size_and_its_truths():
-    entry, _ = describe_scene("balls_in_a_box")
+    entry = list_scene("balls_in_a_box")
     assert entry.size == "64 particles in 2-D, 2 s"
     assert entry.truth.startswith("closed form; every |velocity component| is conserved")
-    entry, _ = describe_scene("heavy_top")
-    assert entry.size == "2 bodies in 3-D, 1.96 s"
-    entry, _ = describe_scene("hanging_rope")
+    assert not entry.smooth
+    assert list_scene("heavy_top").size == "2 bodies in 3-D, 1.96 s"
+    entry = list_scene("hanging_rope")
     assert entry.size == "25 particles in 2-D, 24 springs, 4 s"
+    assert entry.smooth
     assert "catenary" in str(entry)
     assert max(map(len, str(entry).splitlines())) <= 110
+
+
+def demand_listed_as_built(name):
+    built = describe_problem(name, build_scene(name))
+    assert list_scene(name) == built, "run physjax.scenes.catalogue.write_table()"
+
+
+@pytest.mark.parametrize("name", ["projectile", "bouncing_ball", "rolling"])
+def test_what_the_list_says_is_so(name):
+    demand_listed_as_built(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
+def test_what_the_list_says_of_each_scene_is_so(name):
+    demand_listed_as_built(name)
+
+
+def test_the_gallery_is_listed_without_building_a_scene(monkeypatch, capsys):
+    for name, build in SCENES.items():
+        unbuildable = functools.wraps(build)(lambda: pytest.fail("not in the table: run write_table()"))
+        monkeypatch.setitem(SCENES, name, unbuildable)
+    assert main(["scenes"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in (*SCENES, *FAILURES))
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.checks import as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.particles import callable_name
 from physjax.scene import Scene
 from physjax.stepping.simulate import simulate
@@ -127,6 +128,7 @@ class Ablation(NamedTuple):
         return draw_ablation(self, figure)
 
 
+@announce_compiling("ablate")
 def ablate(
     scene: Scene,
     outcome: Outcome,

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from physjax.backend import read_work_clock
 from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.scene import Scene
 from physjax.stepping.adaptive import adaptive
 from physjax.stepping.methods import METHODS, rk4
@@ -53,6 +54,7 @@ LARGEST_COMPARED_LIMIT = 1e6
 """Stands for an infinite stability limit where methods are compared, so that two that are always stable are equals."""
 
 
+@announce_compiling("recommend")
 def recommend(
     scene: Scene,
     *,

@@ -31,7 +31,7 @@ from physjax.study.accuracy.reference_solution import ReferenceSolution
 from physjax.study.accuracy.result import Run
 from physjax.study.energy.quantities import Conserved
 from physjax.study.problem import Problem
-from physjax.timing import time_repeatedly
+from physjax.timing import Result, time_repeatedly
 from physjax.vectors import scale
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ ROUNDING_ERRORS = {"float64": 1e-7, "float32": 1e-3}
 """Errors below which refinements that bring nothing are put down to rounding, relative to the path."""
 STALLED_ERROR_RATIO = 0.9
 """A refinement that leaves more than this share of the error has brought nothing."""
+LONGEST_TIMING = 4.0
+"""Time for all repeats of a run, in those that its budget allows to one."""
 EVALUATIONS_PER_TRIED_STEP = 3
 """Steps of the method inside an adaptive one for each that it tries: one whole and two halves."""
 
@@ -107,11 +109,13 @@ class Comparison(NamedTuple):
             drifts = tuple(float(d) for d in _measure_drifts(scene, times, states, self.problem.conserved))
         return {"final_error": at_end, "path_error": on_path, "drifts": drifts, "errors": tuple(others)}
 
-    def measure_times(self, run: Callable[[], object]) -> Times:
-        """The least and the median time of a run [s]."""
-        # one that takes twice its budget is the last of its method: it need not be timed well
-        timing = time_repeatedly(run, self.budget.repeats, longest=2 * self.budget.seconds)[1]
-        return {"seconds": timing.least, "seconds_median": timing.median}
+    def measure_times(self, run: Callable[[], Result]) -> tuple[Result, Times]:
+        """What a run returns, and its least and median time [s]."""
+        # one that takes twice its budget is the last of its method: it need not be timed well; and the longer a run is, the
+        # less a moment disturbs it, and the fewer repeats it needs
+        seconds = self.budget.seconds
+        result, timing = time_repeatedly(run, self.budget.repeats, longest=2 * seconds, total=LONGEST_TIMING * seconds)
+        return result, {"seconds": timing.least, "seconds_median": timing.median}
 
     def is_fine_enough(self, runs: Sequence[Run]) -> bool:
         """Whether the budget or rounding ends the refinement; steps that were given all run."""
@@ -127,11 +131,12 @@ def run_method(
     many = entry if comparison.batch == 1 else compile_run(problem, method, dtype, copies=comparison.batch)
     runs: list[Run] = []
     for fineness in _list_finenesses(comparison, entry):
-        states = entry(fineness)
+        found, times = comparison.measure_times(partial(many, fineness))
+        states = found if many is entry else entry(fineness)
         runs.append(
             Run(
                 **_identify(entry.variant),
-                **comparison.measure_times(partial(many, fineness)),
+                **times,
                 **comparison.measure_errors(entry.scene, states),
                 **_count_effort(entry, fineness),
                 compile_seconds=entry.compile_seconds,
@@ -151,12 +156,12 @@ def run_gradient(comparison: Comparison, scene: Scene, method: Callable, treatme
     truth, runs = comparison.truth, []
     largest = float(np.abs(np.asarray(truth.slopes.place)).max())
     for fineness in _list_finenesses(comparison, entry):
-        _, slopes = entry(fineness)
+        (_, slopes), times = comparison.measure_times(partial(entry, fineness))
         off = path.moments(truth.scene, truth.times, slopes, truth.slopes, largest)
         runs.append(
             Run(
                 **_identify(entry.variant),
-                **comparison.measure_times(partial(entry, fineness)),
+                **times,
                 **_count_effort(entry, fineness),
                 final_error=float(off[-1]),
                 path_error=float(off.max()),
@@ -172,8 +177,8 @@ def run_gradient(comparison: Comparison, scene: Scene, method: Callable, treatme
 def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractERK") -> list[Run]:
     """A diffrax solver with adaptive steps, from loose to tight tolerance; one compilation."""
     size = smallest_size(scene)
-    times = jnp.asarray(comparison.truth.times, scene.state.dtype)
-    arguments = lambda tol: (times, times[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
+    moments = jnp.asarray(comparison.truth.times, scene.state.dtype)
+    arguments = lambda tol: (moments, moments[-1], jnp.asarray(tol), jnp.asarray(tol * size), solver, False)  # noqa: E731
     started = time.perf_counter()
     compiled = solve_ode.lower(scene, *arguments(1e-3)).compile()
     compile_seconds = time.perf_counter() - started
@@ -186,7 +191,8 @@ def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractERK
     name, dtype = f"diffrax {type(solver).__name__}", np.dtype(scene.state.dtype).name
     runs: list[Run] = []
     for tol in comparison.tolerances:
-        states, success, stats = compiled(scene, *arguments(tol))
+        found, times = comparison.measure_times(partial(timed, *arguments(tol)))
+        states, success, stats = found if comparison.batch == 1 else compiled(scene, *arguments(tol))
         steps, measured = int(stats["num_steps"]), comparison.measure_errors(scene, states)
         if not success:
             measured["final_error"] = measured["path_error"] = float("nan")
@@ -197,7 +203,7 @@ def run_rival(comparison: Comparison, scene: Scene, solver: "diffrax.AbstractERK
                 treatment=AS_GIVEN,
                 adaptive=True,
                 dtype=dtype,
-                **comparison.measure_times(partial(timed, *arguments(tol))),
+                **times,
                 **measured,
                 dt=None,
                 tolerance=tol,

@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.particles import Particles
 from physjax.scene import Scene
 from physjax.stepping.methods import METHODS
@@ -36,6 +37,7 @@ HORIZON_ERROR_SHARE = 1e-2
 """Share of the path to which rounding may grow before errors from point to point mean nothing."""
 
 
+@announce_compiling("work_precision")
 def work_precision(
     problem: Problem | Scene,
     methods: Sequence[Callable] | None = None,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
+from physjax.compiling import announce_compiling
 from physjax.scene import Scene
 from physjax.trajectory import Trajectory
 from physjax.vectors import cross, norm
@@ -114,6 +115,7 @@ ANGULAR_MOMENTUM = Conserved(
 """Angular momentum about the origin, its errors measured by Σm|r||v|, and |L| of rigid bodies."""
 
 
+@announce_compiling("the ledger")
 def ledger(trajectory: Trajectory, scene: Scene | None = None) -> "Ledger":
     """Where the energy of a run went, and its momentum and angular momentum: a `Ledger`, to be printed or drawn (`.plot()`).
 

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none, demand_all
+from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
 from physjax.linear import solve_columns
 from physjax.particles import Particles, demand_particles
@@ -111,6 +112,7 @@ class Aimed(eqx.Module):
 
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
+@announce_compiling("aim_at")
 def aim_at(
     scene: Scene,
     target: ArrayLike,

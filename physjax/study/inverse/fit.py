@@ -12,6 +12,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
+from physjax.compiling import announce_compiling
 from physjax.study.inverse.solve import solve
 
 
@@ -31,6 +32,7 @@ class Fit(NamedTuple):
     covariance: Float[Array, "numbers numbers"]
 
 
+@announce_compiling("fit")
 def fit(
     predict: Callable[[PyTree], PyTree],
     guess: PyTree,

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import as_real_quantity, demand_known
+from physjax.compiling import announce_compiling
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.simulate import simulate
@@ -64,6 +65,7 @@ class GradientHealth(eqx.Module):
         return draw_gradient_health(self, ax)
 
 
+@announce_compiling("the gradients")
 def health(
     scene: Scene,
     method: Callable,

@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import as_positive_integer, as_real_array, as_real_quantity, concrete_or_none, demand_all
+from physjax.compiling import announce_compiling
 
 MAX_NEWTON_STEPS = 8
 """Newton steps at most from where the safe search ended to the last digits."""
@@ -40,6 +41,7 @@ class Minimum(NamedTuple):
     steps: Int[Array, ""]
 
 
+@announce_compiling("solve")
 def solve(
     residual: Callable[[PyTree], PyTree],
     guess: PyTree,
@@ -113,6 +115,7 @@ def _polish_root(
     return inner, largest_residual(inner) <= vanishing
 
 
+@announce_compiling("minimise")
 def minimise(
     cost: Callable[[PyTree], Array],
     guess: PyTree,

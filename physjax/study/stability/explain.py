@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.particles import Particles, demand_particles
 from physjax.scene import Scene
 from physjax.select import select_lane
@@ -89,6 +90,7 @@ class Explanation(NamedTuple):
         }[self.cause]
 
 
+@announce_compiling("explain")
 def explain(
     run: Trajectory | Scene,
     method: Callable | None = None,

@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.checks import as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.particles import Particles, callable_name
 from physjax.parts import as_module
 from physjax.scene import Scene
@@ -112,6 +113,7 @@ def region(
         return Region(callable_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
 
 
+@announce_compiling("the limit")
 def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
     """The largest stable dt of a scene under a method, predicted from its forces about a state (the start, if not given).
 

@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.checks import as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.particles import callable_name
 from physjax.parts import as_module
 from physjax.scene import Scene
@@ -60,6 +61,7 @@ class StabilityMap(NamedTuple):
         return draw_stability_map(self, figure)
 
 
+@announce_compiling("the map")
 def map(
     scene: Scene | Callable[[float], Scene],
     methods: Sequence[Callable],

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.compiling import announce_compiling
 from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.scene import Scene
@@ -48,6 +49,7 @@ TRIAL_STEPS = 16
 """Steps tried at once; three rounds of them narrow five decades down to 0.3 %."""
 
 
+@announce_compiling("measure_limit")
 def measure_limit(
     scene: Scene,
     method: Callable,

@@ -34,6 +34,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from physjax.checks import as_positive_integer
+from physjax.compiling import announce_compiling
 from physjax.study.sweeps import store as chunks
 from physjax.study.sweeps.batching import LaneProgram, Layout, choose_layout, compile_batch, trace_measure
 from physjax.study.sweeps.design import Lanes, build_lanes, latin_hypercube, sobol
@@ -45,6 +46,7 @@ BATCH_MEMORY_BYTES = 1 << 30
 """Bytes that batches may take by default; the results themselves come on top where they are kept in memory."""
 
 
+@announce_compiling("the sweep")
 def sweep(
     measure: Callable[..., PyTree],
     axes: Mapping[str, PyTree],
