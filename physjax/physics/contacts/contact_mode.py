@@ -12,7 +12,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import any_lane, bounded_while_loop
+from physjax.backend import MIN_LANES_TO_SELECT, any_lane, bounded_while_loop
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.resting import Reaction
@@ -91,7 +91,7 @@ def make_free_mode(scene: Scene, surfaces: Surfaces) -> ContactMode:
 
 def apply_contact_mode(scene: Scene, surfaces: Surfaces, mode: ContactMode) -> Scene:
     """The scene with the reactions of a mode among its forces."""
-    state, any_contact = scene.state, any_lane(mode.pressed)
+    state, any_contact = scene.state, None if _is_cheap(surfaces, scene) else any_lane(mode.pressed)
     places = assign_places(mode.pressed, state)
     pressed = mode.pressed if places is None else jnp.any(places, axis=1)
     number = lambda flag: flag.astype(state.dtype)  # noqa: E731
@@ -104,8 +104,13 @@ def start_leg(scene: Scene, surfaces: Surfaces, mode: ContactMode, t: Time) -> t
     state, time = scene.state, to_float_time(t)
     faces = surfaces.facing(time, state.position)
     put = lambda: put_on_surfaces(faces, faces.measure(time, state), mode, state)  # noqa: E731
-    on = lax.cond(any_lane(mode.pressed), put, lambda: state)
+    on = put() if _is_cheap(surfaces, scene) else lax.cond(any_lane(mode.pressed), put, lambda: state)
     return apply_contact_mode(scene.replace(state=on), faces, mode), faces
+
+
+def _is_cheap(surfaces: Surfaces, scene: Scene) -> bool:
+    """Whether reactions are computed without asking whether any lane is in contact: a branch takes longer, also to compile."""
+    return len(surfaces) == 1 and scene.state.velocity.size < MIN_LANES_TO_SELECT
 
 
 def assign_places(pressed: Array, state: Particles) -> Bool[Array, "places surfaces *lanes"] | None:

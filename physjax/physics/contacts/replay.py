@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from physjax.backend import any_lane
+from physjax.backend import MIN_LANES_TO_SELECT, any_lane
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.contact_mode import ContactMode, make_free_mode, start_leg
@@ -146,6 +146,8 @@ def _find_moment(
             change = (value - lax.stop_gradient(value)) / slope
             return carry[0] - jnp.where(last, 0.0, change), end, guards
 
+        if slope.size < MIN_LANES_TO_SELECT:  # moving few lanes again is less work than to ask, and sooner compiled
+            return move_again(), None
         return lax.cond(last | any_lane(jnp.isfinite(slope)), move_again, lambda: carry), None
 
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(move, logged))

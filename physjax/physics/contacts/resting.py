@@ -28,7 +28,8 @@ class Reaction(eqx.Module):
     place, its second and so on (None: every surface has a place of its own), `pressed` which places are taken (1 or 0),
     and `slip` the direction in which the lane slips there at the start of the leg. Friction keeps that direction through
     the leg, beyond the moment at which a slide stops: the path stays smooth, and the stop is found as a root on it.
-    Lanes that stick (`still`) do not accelerate at all.
+    Lanes that stick (`still`) do not accelerate at all. Without `any_contact` the reactions are always computed: for a
+    single surface and few lanes that is less work than to ask.
     """
 
     surfaces: Surfaces
@@ -36,10 +37,12 @@ class Reaction(eqx.Module):
     pressed: Float[Array, "places *lanes"]
     still: Float[Array, "*lanes"]
     slip: Float[Array, "places *lanes dim"] | None
-    any_contact: Bool[Array, ""]
+    any_contact: Bool[Array, ""] | None
 
     def __call__(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:
         """The acceleration [m/s²] of each lane with its reactions added."""
+        if self.any_contact is None:
+            return self._add_reactions(t, state, acceleration)
         return lax.cond(self.any_contact, lambda: self._add_reactions(t, state, acceleration), lambda: acceleration)
 
     def _add_reactions(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:

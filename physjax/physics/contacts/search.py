@@ -146,8 +146,9 @@ def _advance(
     motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, now: Progress, slopes: bool
 ) -> tuple[Progress, Leg]:
     """A turn of every lane that is under way: it moves once, for the duration that it proposes."""
-    going, refining = _is_under_way(now), now.bracket.refining
-    tries, leg_start = going & ~refining, t + now.elapsed
+    going, refining = _is_under_way(now), now.bracket.refining & _is_under_way(now)
+    # lanes wait for those that refine, so that what only a new leg needs is computed once for all of them
+    tries, leg_start = going & ~any_lane(refining), t + now.elapsed
     rest = jnp.maximum(dt - now.elapsed, shortest_duration(dt))
     here = scene.replace(state=now.state)
     # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
@@ -168,7 +169,7 @@ def _advance(
     held = apply_contact_mode(scene.replace(state=choose_lanes(tries, put, now.state)), faces, mode)
     shortest = shortest_duration(dt)
     duration = jnp.where(refining, jnp.maximum(now.bracket.next, shortest), rest)
-    end = materialise_where(going, lambda: motion(held, leg_start, duration).state, now.state)
+    end = materialise_where(tries | refining, lambda: motion(held, leg_start, duration).state, now.state)
     bracket = _begin_bracket(held, faces, mode, tries, end, start_time, rest, now.bracket)
     arrives = tries & ~bracket.refining
     at_end = now._replace(
@@ -184,9 +185,9 @@ def _advance(
     quiet = at_end, Verdict(jnp.zeros_like(now.legs), nothing, nothing, nothing)
 
     def refine() -> tuple[Progress, Verdict]:
-        return _refine(held, faces, refining & going, leg_start, duration, end, dt, at_end)
+        return _refine(held, faces, refining, leg_start, duration, end, dt, at_end)
 
-    after, verdict = lax.cond(any_lane(refining & going), refine, lambda: quiet)
+    after, verdict = lax.cond(any_lane(refining), refine, lambda: quiet)
     slope = jnp.zeros_like(dt)
     if slopes:
         found = verdict.bounces | verdict.stops

@@ -6,15 +6,14 @@ by lane, and of many lanes only those that meet something are computed again.
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.backend import MIN_LANES_TO_SELECT, compact_and_apply, materialise, materialise_where
+from physjax.backend import MIN_LANES_TO_SELECT, any_lane, compact_and_apply, materialise_where
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.parts import holds_user_code
@@ -58,21 +57,14 @@ def impact(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
         meets = meets & ~scene.held
     others = (meets, scene, t, dt)
     cut, masks = scene.may_be_cut(), scene.build_lane_mask(others)
-    along = partial(_step_through_contacts, motion)
-    # what is gathered has the lanes first
-    turned = lambda changing, *others: _lanes_first(along(_lanes_last(changing), *others))  # noqa: E731
-    end, since = _lanes_last(
-        compact_and_apply(turned, meets, _lanes_first((end, since)), *others, masks=masks, cut=cut)
-    )
-    return _store(scene, end, since)
 
+    def go_on(changing: tuple[Particles, tuple], *others: Any) -> tuple[Particles, tuple]:
+        state, since = _step_through_contacts(motion, (changing[0], jnp.stack(changing[1])), *others)
+        return state, tuple(since)
 
-def _lanes_first(changing: tuple[Particles, Array]) -> tuple[Particles, Array]:
-    return changing[0], jnp.moveaxis(changing[1], 0, -1)
-
-
-def _lanes_last(changing: tuple[Particles, Array]) -> tuple[Particles, Array]:
-    return changing[0], jnp.moveaxis(changing[1], -1, 0)
+    # lanes are picked from arrays that have them first
+    end, since = compact_and_apply(go_on, meets, (end, tuple(since)), *others, masks=masks, cut=cut)
+    return _store(scene, end, jnp.stack(since))
 
 
 def _step_in_contact(motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array) -> tuple[Particles, Array]:
@@ -86,8 +78,10 @@ def _step_in_contact(motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, 
         return decide_contact_mode(scene, surfaces, surfaces.measure(time, scene.state), since, t, dt)
 
     held, _ = start_leg(scene, surfaces, mode := materialise_where(touches, decide, make_free_mode(scene, surfaces)), t)
-    # computed once: everything that reads it would compute the step again
-    end = materialise(to_float_time(t), lambda: motion(held, t, dt).state)
+    # where no lane is in contact, a step without branches for reactions; and what a branch returns is computed once
+    end = lax.cond(
+        any_lane(mode.pressed), lambda: motion(held, t, dt).state, lambda: motion(scene, t, dt).state
+    )
     return end, jnp.where(mode.pressed, since, jnp.inf)
 
 
