@@ -28,6 +28,7 @@ from physjax.vectors import (
     conjugate_quaternion,
     cross,
     dot,
+    multiply_by_vector,
     multiply_quaternions,
     rotate_components,
     rotate_vector,
@@ -315,40 +316,34 @@ def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
 def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
     """The quaternion from the principal axes to the world, in components."""
     q = components(bodies.orientation)
-    return (
-        q
-        if inertia.axes is None
-        else multiply_quaternions(q, components(broadcast_vector(inertia.axes, bodies.orientation)))
-    )
+    if inertia.axes is None:
+        return q
+    return multiply_quaternions(q, components(broadcast_vector(inertia.axes, bodies.orientation)))
 
 
 def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
     """The orientation of bodies whose principal axes have the quaternion `frame`: the inverse of `_principal_frame`."""
     if inertia.axes is not None:
-        frame = multiply_quaternions(
-            frame, conjugate_quaternion(components(broadcast_vector(inertia.axes, bodies.orientation)))
-        )
+        axes = components(broadcast_vector(inertia.axes, bodies.orientation))
+        frame = multiply_quaternions(frame, conjugate_quaternion(axes))
     return stack_components(frame)
 
 
 def _orientation_rate(bodies: RigidBodies, inertia: Inertia) -> Array:
     """q' = ½ q (0, ω) with ω in the body frame, which is cheaper than ½ (0, ω) q with ω in the world frame."""
     frame = _principal_frame(bodies, inertia)
-    x, y, z = _apply_inverse_principal(frame, inertia, bodies.angular_momentum)
-    return _body_frame(multiply_quaternions(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
+    half = _apply_inverse_principal(frame, 0.5 * inertia.inverse, bodies.angular_momentum)
+    return _body_frame(multiply_by_vector(frame, half), bodies, inertia)
 
 
-def _apply_inverse_principal(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
+def _apply_inverse_principal(frame: list[Array], inverse: Array, vector: Array) -> list[Array]:
     """I⁻¹ Rᵀ times a vector of the world frame, in components along the principal axes."""
-    parts = zip(
-        components(broadcast_vector(inertia.inverse, vector)),
-        rotate_components(conjugate_quaternion(frame), components(vector)),
-        strict=True,
-    )
-    return [number * part for number, part in parts]
+    turned = rotate_components(conjugate_quaternion(frame), components(vector))
+    numbers = components(broadcast_vector(inverse, vector))
+    return [number * part for number, part in zip(numbers, turned, strict=True)]
 
 
 def apply_inverse_inertia(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
     """R I⁻¹ Rᵀ times a vector of the world frame: the change of ω by an angular impulse."""
     frame = _principal_frame(bodies, inertia)
-    return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia, vector)))
+    return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia.inverse, vector)))
