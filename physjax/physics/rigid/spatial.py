@@ -265,6 +265,15 @@ def to_world_frame(bodies: RigidBodies, vector: NestedArrayLike) -> Float[Array,
     return rotate_vector(bodies.orientation, broadcast_vector(jnp.asarray(vector, bodies.dtype), bodies.position))
 
 
+def to_world_frame_each(bodies: RigidBodies, vectors: NestedArrayLike) -> Float[Array, "vectors *lanes 3"]:
+    """Several vectors of the body frame, `(vectors, 3)` or `(vectors, *lanes, 3)`, in the world frame in one evaluation."""
+    vectors, lanes = jnp.asarray(vectors, bodies.dtype), bodies.lanes
+    if vectors.ndim == 2:
+        vectors = vectors.reshape(len(vectors), *(1 for _ in lanes), 3)
+    shape = (len(vectors), *lanes)
+    return rotate_vector(jnp.broadcast_to(bodies.orientation, (*shape, 4)), jnp.broadcast_to(vectors, (*shape, 3)))
+
+
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
     """ω = R I⁻¹ Rᵀ L [rad/s], in the world frame.
 
