@@ -84,10 +84,10 @@ class Joints(Load):
         table = jnp.concatenate(parts, axis=-1)
         found = jnp.take(table, self._bodies_of_ends, axis=-2, mode="clip")
         cuts = np.cumsum([part.shape[-1] for part in parts])
-        position, orientation, *more = jnp.split(found, cuts[:-1], axis=-1)
+        position, orientation, *others = jnp.split(found, cuts[:-1], axis=-1)
         points = jnp.swapaxes(self.points, 0, 1).reshape(-1, 3)
         arm = rotate_vector(orientation, broadcast_vector(points, position))
-        return [arm, position + arm, *more]
+        return [arm, position + arm, *others]
 
     @property
     def _bodies_of_ends(self) -> np.ndarray:
