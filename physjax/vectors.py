@@ -38,6 +38,16 @@ def stack_components(parts: list[Float[Array, "*lanes"]]) -> Float[Array, "*lane
     return jnp.stack(parts, axis=-1)
 
 
+def split_components(v: Float[Array, "*lanes dim"]) -> list[Float[Array, "*lanes 1"]]:
+    """The components one by one, each with an axis of length 1: half of the operations of `components`."""
+    return [v[..., i : i + 1] for i in range(v.shape[-1])]
+
+
+def join_components(parts: list[Float[Array, "*lanes 1"]]) -> Float[Array, "*lanes dim"]:
+    """A vector from components that have kept their axis."""
+    return jnp.concatenate(parts, axis=-1)
+
+
 # The functions themselves take the plain root, which is fastest. Their derivative rules are written with values that are
 # safe to differentiate again: a loop in reverse mode drops custom rules, and the next derivative would be the plain root's.
 
@@ -92,8 +102,8 @@ def _unit_jvp(primals, tangents):
 
 def cross(a: Float[Array, "*lanes 3"], b: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """Vector product a × b in three dimensions."""
-    (ax, ay, az), (bx, by, bz) = ([vector[..., i : i + 1] for i in range(3)] for vector in (a, b))
-    return jnp.concatenate([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    (ax, ay, az), (bx, by, bz) = split_components(a), split_components(b)
+    return join_components([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def turn_left(v: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes 2"]:
@@ -174,6 +184,13 @@ def multiply_quaternions(a: list, b: list) -> list:
     ]
 
 
+def multiply_by_vector(q: list, v: list) -> list:
+    """Hamilton's product q (0, v), in components: (-u·v, w v + u × v), u = (x, y, z)."""
+    w, x, y, z = q
+    a, b, c = v
+    return [-(x * a + y * b + z * c), w * a + (y * c - z * b), w * b + (z * a - x * c), w * c + (x * b - y * a)]
+
+
 def conjugate_quaternion(q: list) -> list:
     """The inverse rotation, in components: (w, -x, -y, -z)."""
     w, x, y, z = q
@@ -181,18 +198,19 @@ def conjugate_quaternion(q: list) -> list:
 
 
 def rotate_components(q: list, v: list) -> list:
-    """The vector v rotated by the unit quaternion q, in components: v + 2w u × v + 2u × (u × v), u = (x, y, z)."""
+    """The vector v rotated by the unit quaternion q, in components: v + w t + u × t, t = 2u × v, u = (x, y, z)."""
     w, x, y, z = q
     a, b, c = v
-    p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    # doubled by a sum: a literal 2 is two more operations of the program
+    p, q, r = (part + part for part in (y * c - z * b, z * a - x * c, x * b - y * a))
     return [a + w * p + y * r - z * q, b + w * q + z * p - x * r, c + w * r + x * q - y * p]
 
 
 def rotate_vector(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """The vector v rotated by the unit quaternion q: from the body frame to the world frame, for an orientation q."""
-    return stack_components(rotate_components(components(q), components(v)))
+    return join_components(rotate_components(split_components(q), split_components(v)))
 
 
 def rotate_vector_back(q: Float[Array, "*lanes 4"], v: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
     """The vector v rotated by the inverse of the unit quaternion q: from the world frame to the body frame."""
-    return stack_components(rotate_components(conjugate_quaternion(components(q)), components(v)))
+    return join_components(rotate_components(conjugate_quaternion(split_components(q)), split_components(v)))

@@ -16,6 +16,8 @@ from physjax.vectors import (
     conjugate_quaternion,
     cross,
     dot,
+    join_components,
+    multiply_by_vector,
     multiply_quaternions,
     norm,
     root_and_inverse,
@@ -24,6 +26,7 @@ from physjax.vectors import (
     rotate_vector_back,
     scale,
     spin,
+    split_components,
     square_root,
     stack_components,
     turn_left,
@@ -40,6 +43,7 @@ def everything(a, b, flat, number, vector, amount):
     p, q = ([number, *components(v)] for v in (a, b))
     return {
         "multiply_quaternions": stack_components(multiply_quaternions(p, q)),
+        "multiply_by_vector": stack_components(multiply_by_vector(p, components(b))),
         "conjugate_quaternion": stack_components(conjugate_quaternion(p)),
         "rotate_components": stack_components(rotate_components(p, components(b))),
         "rotate_vector": rotate_vector(stack_components(p), b),
@@ -48,6 +52,8 @@ def everything(a, b, flat, number, vector, amount):
         "dot in the plane": dot(flat, turn_left(flat) + flat),
         "components": components(a)[1],
         "stack_components": stack_components(components(a)),
+        "split_components": split_components(a)[1],
+        "join_components": join_components(split_components(a)),
         "square_root": square_root(dot(a, a)),
         "root_and_inverse": stack_components(list(root_and_inverse(dot(a, a)))),
         "norm": norm(a),
@@ -80,6 +86,7 @@ def expected(a, b, flat, number, vector, amount):
     around = (size(p, axis=-1) * np.hypot(number, size(b, axis=-1)))[:, None]
     return {
         "multiply_quaternions": (twist, around),
+        "multiply_by_vector": (np.concatenate([-np.sum(a * b, axis=-1, keepdims=True), n * b + bent], axis=-1), around),
         "conjugate_quaternion": (p * [1, -1, -1, -1], 0.0),
         "rotate_components": (b + 2 * n * bent + twice, far),
         "rotate_vector": (b + 2 * n * bent + twice, far),
@@ -87,6 +94,8 @@ def expected(a, b, flat, number, vector, amount):
         "dot": (np.sum(a * b, axis=-1), products[:, 0]),
         "components": (a[:, 1], 0.0),
         "stack_components": (a, 0.0),
+        "split_components": (a[:, 1:2], 0.0),
+        "join_components": (a, 0.0),
         "dot in the plane": (np.sum(flat * flat, axis=-1), 2 * np.sum(flat * flat, axis=-1)),
         "square_root": (length, length),
         "root_and_inverse": (np.stack([length, 1 / length], axis=-1), np.stack([length, 1 / length], axis=-1)),

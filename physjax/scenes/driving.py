@@ -2,7 +2,6 @@
 
 from itertools import product
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -12,13 +11,13 @@ from physjax.checks import Numbers, quantity
 from physjax.physics import contacts, forces, rigid
 from physjax.physics.rigid import inertia
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import to_world_frame
+from physjax.physics.rigid.spatial import to_world_frame_each
 from physjax.scene import Scene
 from physjax.scenes.registry import scene
 from physjax.show import solids
 from physjax.study.problem import Problem, Truth
 from physjax.trajectory import Trajectory
-from physjax.vectors import cross, dot, norm, scale, stack_components, unit
+from physjax.vectors import axis_vector, cross, dot, join_components, norm, scale, split_components, square_root, unit
 
 BODY_SIZE = np.array([3.0, 1.0, 1.7])
 BODY_PARTS = [
@@ -53,30 +52,32 @@ class Suspension(rigid.Load):
 
     def wrench(self, t: ArrayLike, bodies: rigid.RigidBodies, inertia: Inertia) -> rigid.Wrench:
         """The sum of the tyres' forces and torques, each at its point of contact."""
-        ahead, up = (to_world_frame(bodies, axis) for axis in (AHEAD, UP))
-        velocity, omega = scale(1 / inertia.mass, bodies.momentum), rigid.angular_velocity(bodies, inertia)
-
-        def wheel(mount):
-            reach = rigid.point(bodies, mount)[..., 1] / jnp.maximum(up[..., 1], MIN_UP_COSINE)
-            low = to_world_frame(bodies, mount) - scale(reach, up)
-            pressed = jnp.where(up[..., 1] > MIN_UP_COSINE, jnp.maximum(self.length - reach, 0.0), 0.0)
-            force = self._tyre_force(t, pressed, velocity + cross(omega, low), ahead)
-            return rigid.Wrench(force, cross(low, force))
-
-        return jax.tree.map(sum, jax.vmap(wheel)(jnp.asarray(WHEEL_MOUNTS, bodies.dtype)))
+        # the wheels along an axis in front: one evaluation for all
+        turned = to_world_frame_each(bodies, np.concatenate([[AHEAD, UP], WHEEL_MOUNTS]))
+        ahead, up, mounts = turned[0], turned[1], turned[2:]
+        steep = up[..., 1]
+        reach = (bodies.position[..., 1] + mounts[..., 1]) / jnp.maximum(steep, MIN_UP_COSINE)
+        low = mounts - scale(reach, jnp.broadcast_to(up, mounts.shape))
+        pressed = jnp.where(steep > MIN_UP_COSINE, jnp.maximum(self.length - reach, 0.0), 0.0)
+        omega = jnp.broadcast_to(rigid.angular_velocity(bodies, inertia), low.shape)
+        force = self._tyre_force(t, pressed, scale(1 / inertia.mass, bodies.momentum) + cross(omega, low), ahead)
+        return rigid.Wrench(jnp.sum(force, axis=0), jnp.sum(cross(low, force), axis=0))
 
     def _tyre_force(self, t: ArrayLike, pressed: Array, speed: Array, ahead: Array) -> Array:
-        """Normal and horizontal force of a tyre [N], for a compression [m] and a velocity of its contact point [m/s]."""
+        """Normal and horizontal force of tyres [N], for a compression [m] and a velocity of the contact point [m/s]."""
         push = jnp.where(pressed > 0, self.stiffness * pressed - self.damping * speed[..., 1], 0.0)
-        push, none = jnp.maximum(push, 0.0), jnp.zeros_like(push)
-        ahead = unit(stack_components([ahead[..., 0], none, ahead[..., 2]]))
-        aside = stack_components([-ahead[..., 2], none, ahead[..., 0]])
+        push = jnp.maximum(push, 0.0)
+        x, _, z = split_components(ahead)
+        none = jnp.zeros_like(x)
+        ahead = unit(join_components([x, none, z]))
+        x, _, z = split_components(ahead)
+        ahead, aside = (jnp.broadcast_to(way, speed.shape) for way in (ahead, join_components([-z, none, x])))
         stops = -self.brake * jnp.tanh(dot(speed, ahead) / BRAKE_FADE_SPEED)
         drive = jnp.where(t < self.brakes_at, self.throttle, stops) / len(WHEEL_MOUNTS)
         pull = scale(drive, ahead) - scale(self.grip * dot(speed, aside), aside)
         size, most = norm(pull), self.friction * push
         pull = scale(jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0), pull)
-        return pull + stack_components([none, push, none])
+        return pull + axis_vector(push, 1, pull)
 
 
 class Kerb(contacts.Surface):
@@ -87,19 +88,17 @@ class Kerb(contacts.Surface):
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes"]:
         """Distance to the nearest of ground, face, top and edge [m]."""
-        before, above = self._face_distances(position)
-        edge = norm(stack_components([before, above]))
-        kerb = jnp.where((before > 0) & (above > 0), edge, jnp.maximum(before, above))
-        return jnp.minimum(position[..., 1], kerb)
+        _, kerb, height = self._measure_distances(position)
+        return jnp.minimum(height, kerb)[..., 0]
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
         """Away from the nearest of them."""
-        before, above = self._face_distances(position)
-        low = position[..., 1] <= self.signed_distance(t, position)
-        edge, face = ~low & (before > 0) & (above > 0), ~low & (before > above)
-        x = jnp.where(edge, before, jnp.where(face, 1.0, 0.0))
-        y = jnp.where(edge, above, jnp.where(face, 0.0, 1.0))
-        return unit(stack_components([-x, y, jnp.zeros_like(x)]))
+        (before, above), kerb, height = self._measure_distances(position)
+        out, face = (before > 0) & (above > 0), before > above
+        x = jnp.where(out, before, face.astype(before.dtype))
+        y = jnp.where(out, above, 1 - face.astype(before.dtype))
+        low = height <= kerb
+        return unit(join_components([jnp.where(low, 0.0, -x), jnp.where(low, 1.0, y), jnp.zeros_like(x)]))
 
     def outline(self, t: float, low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
         """Ground, face and top from side to side of the box: they stay sharp, whatever grid the box is drawn with."""
@@ -110,9 +109,13 @@ class Kerb(contacts.Surface):
         near, far = (np.column_stack([line, np.full(len(line), side)]) for side in (low[2], high[2]))
         return list(np.stack([near[:-1], near[1:], far[1:], far[:-1]], axis=1))
 
-    def _face_distances(self, position: Array) -> tuple[Array, Array]:
-        """Signed distances in front of the face and above the top [m]."""
-        return self.at - position[..., 0], position[..., 1] - self.height
+    def _measure_distances(self, position: Array) -> tuple[tuple[Array, Array], Array, Array]:
+        """In front of the face and above the top; to the kerb; above the ground [m], each with an axis of length 1."""
+        x, height, _ = split_components(position)
+        before, above = self.at - x, height - self.height
+        edge = square_root(before * before + above * above)
+        kerb = jnp.where((before > 0) & (above > 0), edge, jnp.maximum(before, above))
+        return (before, above), kerb, height
 
 
 @scene

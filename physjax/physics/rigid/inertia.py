@@ -56,8 +56,8 @@ class Inertia(eqx.Module):
     @property
     def inverse(self) -> Float[Array, "*lanes 3"]:
         """1/I about each principal axis [1/(kg m²)]; zero where there is no moment."""
-        there = self.principal > 0
-        return jnp.where(there, 1 / jnp.where(there, self.principal, 1.0), 0.0)
+        # a moment that is not there counts as infinite: the inverse is zero, and so are all derivatives
+        return 1 / jnp.where(self.principal > 0, self.principal, jnp.inf)
 
     @property
     def tensor(self) -> np.ndarray:

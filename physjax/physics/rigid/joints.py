@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from physjax.checks import Numbers, as_real_quantity, quantity, unchecked_quantity
 from physjax.loops import Time
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity, to_world_frame
-from physjax.vectors import cross, dot, norm, scale
+from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity
+from physjax.vectors import broadcast_vector, cross, dot, norm, rotate_vector, scale
 
 
 class Joints(Load):
@@ -58,37 +58,44 @@ class Joints(Load):
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """Forces and torques on all bodies, with equal and opposite forces at each joint."""
-        arms, apart = self._locate_arms(bodies)
-        straight = self._take_ends(scale(1 / inertia.mass, bodies.momentum))
-        turning = self._take_ends(angular_velocity(bodies, inertia))
-        fast = [v + cross(omega, arm) for v, omega, arm in zip(straight, turning, arms, strict=True)]
-        pull = self.stiffness * apart + self.damping * (fast[1] - fast[0])
-        forces = jnp.concatenate([pull, -pull], axis=-2)
-        torques = jnp.concatenate([cross(arms[0], pull), cross(arms[1], -pull)], axis=-2)
-        return Wrench(self._sum_by_body(forces, bodies), self._sum_by_body(torques, bodies))
+        straight, omega = scale(1 / inertia.mass, bodies.momentum), angular_velocity(bodies, inertia)
+        arm, place, straight, omega = self._locate_ends(bodies, straight, omega)
+        apart, closing = self._subtract_ends(place), self._subtract_ends(straight + cross(omega, arm))
+        pull = self.stiffness * apart + self.damping * closing
+        force = jnp.concatenate([pull, -pull], axis=-2)
+        total = self._sum_by_body(jnp.concatenate([force, cross(arm, force)], axis=-1), bodies)
+        return Wrench(total[..., :3], total[..., 3:])
 
     def potential(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> Float[Array, "*lanes"]:
         """½k d² [J], halved between the two bodies."""
-        _, apart = self._locate_arms(state)
+        apart = self._subtract_ends(self._locate_ends(state)[1])
         half = 0.25 * self.stiffness * dot(apart, apart)
         shares = jnp.concatenate([half, half], axis=-1)[..., None]
         return self._sum_by_body(shares, state)[..., 0]
 
     def error(self, bodies: RigidBodies) -> Float[Array, "*scenes joints"]:
         """How far the two points of each joint are apart [m]."""
-        return norm(self._locate_arms(bodies)[1])
+        return norm(self._subtract_ends(self._locate_ends(bodies)[1]))
 
-    def _locate_arms(self, bodies: RigidBodies) -> tuple[list[Array], Array]:
-        """From the centers of mass to the points of each joint, and from its first point to its second [m]."""
-        places = [self._take_ends(part) for part in (bodies.position, bodies.orientation)]
-        arms = []
-        for side, (position, orientation) in enumerate(zip(*places, strict=True)):
-            ends = RigidBodies(position, orientation, position, position)
-            arms.append(to_world_frame(ends, jnp.broadcast_to(self.points[:, side], position.shape)))
-        return arms, places[0][1] + arms[1] - places[0][0] - arms[0]
+    def _locate_ends(self, bodies: RigidBodies, *more: Array) -> list[Array]:
+        """Of the ends of joints, first ends then second ends: arm and place [m], and what `more` says of their bodies."""
+        parts = (bodies.position, bodies.orientation, *more)
+        # side by side, so that one gather takes all
+        table = jnp.concatenate(parts, axis=-1)
+        found = jnp.take(table, self._bodies_of_ends, axis=-2, mode="clip")
+        cuts = np.cumsum([part.shape[-1] for part in parts])
+        position, orientation, *others = jnp.split(found, cuts[:-1], axis=-1)
+        points = jnp.swapaxes(self.points, 0, 1).reshape(-1, 3)
+        arm = rotate_vector(orientation, broadcast_vector(points, position))
+        return [arm, position + arm, *others]
 
-    def _take_ends(self, part: Array) -> list[Array]:
-        return [jnp.take(part, np.array([pair[side] for pair in self.pairs]), axis=-2) for side in (0, 1)]
+    @property
+    def _bodies_of_ends(self) -> np.ndarray:
+        return np.asarray(self.pairs).T.ravel()
+
+    def _subtract_ends(self, ends: Array) -> Array:
+        """From the first end of each joint to its second."""
+        return ends[..., len(self.pairs) :, :] - ends[..., : len(self.pairs), :]
 
     def _sum_by_body(self, ends: Array, bodies: RigidBodies) -> Array:
         """What acts on the ends of joints, first ends then second ends, summed body by body.
@@ -96,16 +103,13 @@ class Joints(Load):
         Each body gathers its first end, its second and so on, because a scatter is slow on every device.
         """
         # which end of which joint each body has is known before compiling: the slots are constants of the program
-        bodies_of = np.asarray(self.pairs).T.ravel()
-        nodes = bodies.lanes[-1]
+        bodies_of, nodes = self._bodies_of_ends, bodies.lanes[-1]
         slots = [np.flatnonzero(bodies_of == node) for node in range(nodes)]
+        index = np.full((max(map(len, slots)), nodes), len(bodies_of))
+        for node, slot in enumerate(slots):
+            index[: len(slot), node] = slot
         padded = jnp.concatenate([ends, jnp.zeros_like(ends[..., :1, :])], axis=-2)
-        none = len(bodies_of)
-        total = jnp.zeros((*ends.shape[:-2], nodes, ends.shape[-1]), ends.dtype)
-        for place in range(max(map(len, slots))):
-            index = np.array([slot[place] if place < len(slot) else none for slot in slots])
-            total = total + jnp.take(padded, index, axis=-2)
-        return total
+        return jnp.sum(jnp.take(padded, index, axis=-2, mode="clip"), axis=-3)
 
 
 def hinge(

@@ -95,9 +95,7 @@ def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> F
         >>> print(rigid.point_velocity(body, brick, (0.5, 0.0, 0.0)))
         [1. 1. 0.]
     """
-    return scale(1 / inertia.mass, bodies.momentum) + cross(
-        angular_velocity(bodies, inertia), to_world_frame(bodies, place)
-    )
+    return _follow_arm(bodies, inertia, to_world_frame(bodies, place)).velocity
 
 
 def point_acceleration(
@@ -228,16 +226,20 @@ class AtPoint(Load):
 
     def potential(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> Array | None:
         """Its potential energy [J], if it has one."""
-        return self.force.potential(t, self._build_point_particles(state, mass), mass.mass)
+        return self.force.potential(t, _follow_arm(state, mass, to_world_frame(state, self.point)), mass.mass)
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """The force and its torque."""
         # a moment comes only where the force `sees_moments`
-        force = self.force(t, self._build_point_particles(bodies, inertia), inertia.mass)  # pyright: ignore[reportArgumentType]
-        return Wrench(force, cross(to_world_frame(bodies, self.point), force))
+        arm = to_world_frame(bodies, self.point)
+        force = self.force(t, _follow_arm(bodies, inertia, arm), inertia.mass)  # pyright: ignore[reportArgumentType]
+        return Wrench(force, cross(arm, force))
 
-    def _build_point_particles(self, bodies: RigidBodies, inertia: Inertia) -> Particles:
-        return Particles(point(bodies, self.point), point_velocity(bodies, inertia, self.point))
+
+def _follow_arm(bodies: RigidBodies, inertia: Inertia, arm: Array) -> Particles:
+    """The end of an arm [m] from each center of mass, in the world frame, as a particle: x + r, v + ω × r."""
+    velocity = scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), arm)
+    return Particles(bodies.position + arm, velocity)
 
 
 def _demand_frame(frame: str) -> None:

@@ -28,6 +28,7 @@ from physjax.vectors import (
     conjugate_quaternion,
     cross,
     dot,
+    multiply_by_vector,
     multiply_quaternions,
     rotate_components,
     rotate_vector,
@@ -153,7 +154,10 @@ class RigidBodies(NamedTuple):
 
     def generalised_force(self, scene: Any, t: Time) -> WholeWrench:
         """Total force and torque, a `Wrench` with both; none on bodies that are held."""
-        total = loads(scene, t, self.on_pivot(scene.mass))
+        bodies = self.on_pivot(scene.mass)
+        if any(isinstance(force, Load) for force in scene.forces):
+            bodies = _TurningBodies.measure(bodies, scene.mass)
+        total = loads(scene, t, bodies)
         if scene.held is None:
             return total
         free = 1 - scene.held.astype(self.dtype)
@@ -256,12 +260,37 @@ class RigidBodies(NamedTuple):
         return state.on_pivot(inertia), inertia
 
 
+class _TurningBodies(RigidBodies):
+    """Bodies as the loads of a scene see them: ω is computed once for all that ask for it, whatever they are.
+
+    It belongs to this very record: one that is made of it, by `_replace` or by a map over its arrays, has none.
+    """
+
+    known: tuple[Inertia, Array]
+
+    @classmethod
+    def measure(cls, bodies: RigidBodies, inertia: Inertia) -> "_TurningBodies":
+        """The bodies with their angular velocity [rad/s] for this inertia."""
+        turning = cls(*bodies)
+        turning.known = inertia, angular_velocity(bodies, inertia)
+        return turning
+
+
 # rotation
 
 
 def to_world_frame(bodies: RigidBodies, vector: NestedArrayLike) -> Float[Array, "*lanes 3"]:
     """A vector of the body frame, one for all bodies or one per lane, in the world frame: R v."""
     return rotate_vector(bodies.orientation, broadcast_vector(jnp.asarray(vector, bodies.dtype), bodies.position))
+
+
+def to_world_frame_each(bodies: RigidBodies, vectors: NestedArrayLike) -> Float[Array, "vectors *lanes 3"]:
+    """Several vectors of the body frame, `(vectors, 3)` or `(vectors, *lanes, 3)`, in the world frame in one evaluation."""
+    vectors, lanes = jnp.asarray(vectors, bodies.dtype), bodies.lanes
+    if vectors.ndim == 2:
+        vectors = vectors.reshape(len(vectors), *(1 for _ in lanes), 3)
+    shape = (len(vectors), *lanes)
+    return rotate_vector(jnp.broadcast_to(bodies.orientation, (*shape, 4)), jnp.broadcast_to(vectors, (*shape, 3)))
 
 
 def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*lanes 3"]:
@@ -271,6 +300,8 @@ def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*la
         >>> print(rigid.angular_velocity(body, brick))
         [0. 0. 2.]
     """
+    if isinstance(bodies, _TurningBodies) and hasattr(bodies, "known") and bodies.known[0] is inertia:
+        return bodies.known[1]
     return apply_inverse_inertia(bodies, inertia, bodies.angular_momentum)
 
 
@@ -315,40 +346,34 @@ def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
 def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
     """The quaternion from the principal axes to the world, in components."""
     q = components(bodies.orientation)
-    return (
-        q
-        if inertia.axes is None
-        else multiply_quaternions(q, components(broadcast_vector(inertia.axes, bodies.orientation)))
-    )
+    if inertia.axes is None:
+        return q
+    return multiply_quaternions(q, components(broadcast_vector(inertia.axes, bodies.orientation)))
 
 
 def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
     """The orientation of bodies whose principal axes have the quaternion `frame`: the inverse of `_principal_frame`."""
     if inertia.axes is not None:
-        frame = multiply_quaternions(
-            frame, conjugate_quaternion(components(broadcast_vector(inertia.axes, bodies.orientation)))
-        )
+        axes = components(broadcast_vector(inertia.axes, bodies.orientation))
+        frame = multiply_quaternions(frame, conjugate_quaternion(axes))
     return stack_components(frame)
 
 
 def _orientation_rate(bodies: RigidBodies, inertia: Inertia) -> Array:
     """q' = ½ q (0, ω) with ω in the body frame, which is cheaper than ½ (0, ω) q with ω in the world frame."""
     frame = _principal_frame(bodies, inertia)
-    x, y, z = _apply_inverse_principal(frame, inertia, bodies.angular_momentum)
-    return _body_frame(multiply_quaternions(frame, [0.0, 0.5 * x, 0.5 * y, 0.5 * z]), bodies, inertia)
+    half = _apply_inverse_principal(frame, 0.5 * inertia.inverse, bodies.angular_momentum)
+    return _body_frame(multiply_by_vector(frame, half), bodies, inertia)
 
 
-def _apply_inverse_principal(frame: list[Array], inertia: Inertia, vector: Array) -> list[Array]:
+def _apply_inverse_principal(frame: list[Array], inverse: Array, vector: Array) -> list[Array]:
     """I⁻¹ Rᵀ times a vector of the world frame, in components along the principal axes."""
-    parts = zip(
-        components(broadcast_vector(inertia.inverse, vector)),
-        rotate_components(conjugate_quaternion(frame), components(vector)),
-        strict=True,
-    )
-    return [number * part for number, part in parts]
+    turned = rotate_components(conjugate_quaternion(frame), components(vector))
+    numbers = components(broadcast_vector(inverse, vector))
+    return [number * part for number, part in zip(numbers, turned, strict=True)]
 
 
 def apply_inverse_inertia(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
     """R I⁻¹ Rᵀ times a vector of the world frame: the change of ω by an angular impulse."""
     frame = _principal_frame(bodies, inertia)
-    return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia, vector)))
+    return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia.inverse, vector)))
