@@ -154,10 +154,7 @@ class RigidBodies(NamedTuple):
 
     def generalised_force(self, scene: Any, t: Time) -> WholeWrench:
         """Total force and torque, a `Wrench` with both; none on bodies that are held."""
-        bodies = self.on_pivot(scene.mass)
-        if any(isinstance(force, Load) for force in scene.forces):
-            bodies = _TurningBodies.measure(bodies, scene.mass)
-        total = loads(scene, t, bodies)
+        total = loads(scene, t, self.on_pivot(scene.mass))
         if scene.held is None:
             return total
         free = 1 - scene.held.astype(self.dtype)
@@ -260,22 +257,6 @@ class RigidBodies(NamedTuple):
         return state.on_pivot(inertia), inertia
 
 
-class _TurningBodies(RigidBodies):
-    """Bodies as the loads of a scene see them: ω is computed once for all that ask for it, whatever they are.
-
-    It belongs to this very record: one that is made of it, by `_replace` or by a map over its arrays, has none.
-    """
-
-    known: tuple[Inertia, Array]
-
-    @classmethod
-    def measure(cls, bodies: RigidBodies, inertia: Inertia) -> "_TurningBodies":
-        """The bodies with their angular velocity [rad/s] for this inertia."""
-        turning = cls(*bodies)
-        turning.known = inertia, angular_velocity(bodies, inertia)
-        return turning
-
-
 # rotation
 
 
@@ -300,8 +281,6 @@ def angular_velocity(bodies: RigidBodies, inertia: Inertia) -> Float[Array, "*la
         >>> print(rigid.angular_velocity(body, brick))
         [0. 0. 2.]
     """
-    if isinstance(bodies, _TurningBodies) and hasattr(bodies, "known") and bodies.known[0] is inertia:
-        return bodies.known[1]
     return apply_inverse_inertia(bodies, inertia, bodies.angular_momentum)
 
 
