@@ -12,7 +12,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import MIN_LANES_TO_SELECT, any_lane, bounded_while_loop
+from physjax.backend import any_lane, bounded_while_loop
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.resting import Reaction
@@ -34,6 +34,9 @@ REACH_SHARE = 0.1
 """Share of the way of a step by which truncation may have moved a lane off a surface that it moves along."""
 PLACE_ROUNDING = 64
 """Units of rounding of the place, and of what a step's load moves, that are added to that reach."""
+
+MAX_BRANCHLESS_NUMBERS = 64
+"""Numbers in a velocity up to which a single smooth surface reacts without asking whether it must."""
 
 
 class ContactMode(NamedTuple):
@@ -110,7 +113,8 @@ def start_leg(scene: Scene, surfaces: Surfaces, mode: ContactMode, t: Time) -> t
 
 def _is_cheap(surfaces: Surfaces, scene: Scene) -> bool:
     """Whether reactions are computed without asking whether any lane is in contact: a branch takes longer, also to compile."""
-    return len(surfaces) == 1 and scene.state.velocity.size < MIN_LANES_TO_SELECT
+    few = scene.state.velocity.size <= MAX_BRANCHLESS_NUMBERS
+    return len(surfaces) == 1 and not surfaces.rough.any() and few
 
 
 def assign_places(pressed: Array, state: Particles) -> Bool[Array, "places surfaces *lanes"] | None:
