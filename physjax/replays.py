@@ -11,6 +11,7 @@ import jax
 from jax import lax
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import PyTree
 
 
@@ -35,8 +36,8 @@ def differentiate_by_replay(
             moved = dict(zip(moving, some, strict=True))
             return replay(record, *structure.unflatten([moved.get(i, leaf) for i, leaf in enumerate(primals)]))
 
-        some = [primals[i] for i in moving], [tangents[i] for i in moving]
-        value, change = jax.jvp(again, *map(tuple, some))
+        some, pushes = tuple(primals[i] for i in moving), tuple(tangents[i] for i in moving)
+        value, change = jax.jvp(again, some, pushes)
         # the search's own number, to the last bit, with the derivatives of the replay
         value = jax.tree.map(lambda found, flown: found + (flown - lax.stop_gradient(flown)), result, value)
         return value, change
@@ -76,6 +77,7 @@ def _open_closure(function: Callable, *examples: PyTree) -> tuple[Callable, list
     structure = jax.tree.structure(shape)
 
     def opened(numbers: list, *arguments: PyTree) -> PyTree:
-        return structure.unflatten(jax.core.eval_jaxpr(closed.jaxpr, numbers, *jax.tree.leaves(arguments)))
+        program = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, numbers))
+        return structure.unflatten(program(*jax.tree.leaves(arguments)))
 
     return opened, list(closed.consts)

@@ -4,7 +4,8 @@ Decided once, at the start of a leg: a surface lets go of a lane where the force
 sticks where static friction suffices; else it slides. A decision has no derivatives; what follows from it has.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from physjax.physics.contacts.resting import Reaction
 from physjax.physics.contacts.surfaces import Surfaces, Touch, mask_surfaces, relative_to
 from physjax.scene import Scene
 from physjax.vectors import dot, norm, scale, unit
+
+T = TypeVar("T")
 
 MAX_SETTLING_PASSES = 400
 """Most passes over several surfaces that carry one lane: each shrinks the residual by cos² of the angle between them."""
@@ -109,6 +112,11 @@ def start_leg(scene: Scene, surfaces: Surfaces, mode: ContactMode, t: Time) -> t
     put = lambda: put_on_surfaces(faces, faces.measure(time, state), mode, state)  # noqa: E731
     on = put() if _is_cheap(surfaces, scene) else lax.cond(any_lane(mode.pressed), put, lambda: state)
     return apply_contact_mode(scene.replace(state=on), faces, mode), faces
+
+
+def get_reaction(held: Scene) -> Reaction:
+    """The reactions among the forces of a scene to which a mode was applied."""
+    return cast(Reaction, held.reaction)
 
 
 def _is_cheap(surfaces: Surfaces, scene: Scene) -> bool:
@@ -203,7 +211,7 @@ def _solve_contact_forces(contacts: _ContactStates, load: Array) -> tuple[Array,
         # the force that this surface had is taken back, and what is needed now is put in its place
         now = c.touching * jnp.maximum(force - dot(total, c.normal) - c.curvature_acceleration, 0.0)
         total = total + scale(now - force, c.normal)
-        if c.limit is None:
+        if c.limit is None or friction is None:
             return total, (now, None)
         wanted = friction - (total - scale(dot(total, c.normal), c.normal))
         size, most = norm(wanted), c.limit * now
@@ -233,7 +241,7 @@ def _solve_contact_forces(contacts: _ContactStates, load: Array) -> tuple[Array,
     return bounded_while_loop(lambda carry: any_lane(carry[1]), repeat, start, most=MAX_SETTLING_PASSES)[0][:2]
 
 
-def scan_surfaces(turn, carry, each):
+def scan_surfaces(turn: Callable[[T, Any], tuple[T, Any]], carry: T, each: Any) -> tuple[T, Any]:
     """`lax.scan` over the axis of surfaces; a single one takes its turn without a loop."""
     if jax.tree.leaves(each)[0].shape[0] > 1:
         return lax.scan(turn, carry, each)

@@ -84,7 +84,7 @@ def meet_surface(
     chosen = guard[None] == numbers[:count]
     pick = lambda values: None if values is None else select_surface(chosen, values)  # noqa: E731
     touch = Touch(guards[:count], faces.normal_at(t, at.position), faces.velocity_at(at.velocity))
-    carried, static, kinetic = pick(touch.carried), faces.static_friction(lanes), faces.kinetic_friction(lanes)
+    carried, static, kinetic = map(pick, (touch.carried, faces.static_friction(lanes), faces.kinetic_friction(lanes)))
     slip = None
     if reaction.slip is not None:
         belt = reaction.carry(at)
@@ -98,7 +98,7 @@ def meet_surface(
         pick(faces.curvature_acceleration(t, at)),
         select_surface(chosen, faces.restitution(lanes)),
         pick(faces.friction(lanes)),
-        None if static is None or kinetic is None else _Dry(pick(static), pick(kinetic)),
+        None if static is None or kinetic is None else _Dry(static, kinetic),
         slip,
     )
 

@@ -16,7 +16,7 @@ from jaxtyping import Array
 from physjax.backend import MIN_LANES_TO_SELECT, any_lane
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
-from physjax.physics.contacts.contact_mode import ContactMode, make_free_mode, start_leg
+from physjax.physics.contacts.contact_mode import ContactMode, get_reaction, make_free_mode, start_leg
 from physjax.physics.contacts.impact_response import (
     Verdict,
     measure_guards,
@@ -118,7 +118,7 @@ def _fly_leg(
         motion, held, faces, leg_start, logged, jnp.where(ends, leg.slope, -jnp.inf), verdict.guard
     )
     end_time = leg_start + duration
-    meeting = meet_surface(faces, held.reaction, guards, verdict.guard, to_float_time(end_time), end)
+    meeting = meet_surface(faces, get_reaction(held), guards, verdict.guard, to_float_time(end_time), end)
     after = respond_to_event(meeting, verdict, end)
     rests = active & verdict.rests
     delay = measure_last_flights(meeting, rests, held.acceleration(end_time, end))
@@ -136,7 +136,7 @@ def _find_moment(
 
     def move(duration: Array) -> tuple[Particles, Array]:
         end = motion(held, leg_start, duration).state
-        return end, measure_guards(faces, held.reaction, to_float_time(leg_start + duration), end)
+        return end, measure_guards(faces, get_reaction(held), to_float_time(leg_start + duration), end)
 
     def improve(carry: tuple, last: Array) -> tuple[tuple, None]:
         def move_again() -> tuple:

@@ -1,13 +1,13 @@
 """What a contact does to a velocity: restitution along the normal, friction across it."""
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import Numbers, OptionalNumbers, concrete_or_none, demand_all, quantity
+from physjax.checks import Numbers, concrete_or_none, demand_all, quantity
 from physjax.particles import Particles
 from physjax.vectors import dot, scale
 
@@ -46,12 +46,12 @@ class DryFriction(Protocol):
     """Coefficients of static and of kinetic friction."""
 
     @property
-    def static(self) -> Numbers:
+    def static(self) -> Any:
         """μ_s."""
         ...
 
     @property
-    def kinetic(self) -> Numbers:
+    def kinetic(self) -> Any:
         """μ_k."""
         ...
 
@@ -61,12 +61,12 @@ class Material(Protocol):
     """What a contact needs to know of a surface besides its geometry."""
 
     @property
-    def restitution(self) -> Numbers:
+    def restitution(self) -> Any:
         """K_r."""
         ...
 
     @property
-    def friction(self) -> OptionalNumbers:
+    def friction(self) -> Any:
         """The lecture's K_f."""
         ...
 

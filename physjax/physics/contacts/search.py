@@ -21,6 +21,7 @@ from physjax.physics.contacts.contact_mode import (
     ContactMode,
     apply_contact_mode,
     decide_contact_mode,
+    get_reaction,
     make_free_mode,
     put_on_surfaces,
 )
@@ -102,7 +103,7 @@ def start_progress(scene: Scene, surfaces: Surfaces, dt: Array, active: Array) -
     zero = jnp.zeros_like(dt)
     guards = len(surfaces) + (min(len(surfaces), scene.state.position.shape[-1]) if surfaces.rough.any() else 0)
     watched = jnp.zeros((guards, *dt.shape), bool)
-    bracket = Bracket(jnp.zeros(dt.shape, bool), *[zero] * 8, watched)
+    bracket = Bracket(jnp.zeros(dt.shape, bool), zero, zero, zero, zero, zero, zero, zero, zero, watched)
     none = jnp.zeros(dt.shape, jnp.int32)
     mode = make_free_mode(scene, surfaces)
     return Progress(zero, scene.state, surfaces.touching_since, mode, bracket, none, ~active)
@@ -204,7 +205,7 @@ def _measure_slope(
 
     def follow(duration: Array) -> Array:
         end = motion(held, leg_start, duration).state
-        return select_guard(measure_guards(faces, held.reaction, to_float_time(leg_start + duration), end), guard)
+        return select_guard(measure_guards(faces, get_reaction(held), to_float_time(leg_start + duration), end), guard)
 
     return jax.jvp(follow, (duration,), (jnp.ones_like(duration),))[1]
 
@@ -221,7 +222,9 @@ def _begin_bracket(
 ) -> Bracket:
     """The brackets of the lanes that tried the rest of their step and have an event on the way."""
     start = held.state
-    event = materialise_where(tries, lambda: find_next_event(faces, held.reaction, mode.pressed, start, end, t, rest))
+    event = materialise_where(
+        tries, lambda: find_next_event(faces, get_reaction(held), mode.pressed, start, end, t, rest)
+    )
     hit = tries & event.hit
     if held.held is not None:
         hit = hit & ~held.held
@@ -261,7 +264,7 @@ def _refine(
 ) -> tuple[Progress, Verdict]:
     """The lanes that seek the moment of an event, with a closer bracket, or after the event if they have found it."""
     bracket, impact_time = now.bracket, leg_start + duration
-    guards = measure_guards(faces, held.reaction, to_float_time(impact_time), end)
+    guards = measure_guards(faces, get_reaction(held), to_float_time(impact_time), end)
     watched = jnp.where(bracket.watched, guards, jnp.inf)
     value, guard = jnp.min(watched, axis=0), jnp.argmin(watched, axis=0).astype(jnp.int32)
     closer = _close_bracket(bracket, value)
@@ -273,7 +276,7 @@ def _refine(
     reached = found & (value <= bracket.reach)
 
     def resolve() -> tuple[Particles, Array, Verdict]:
-        meeting = meet_surface(faces, held.reaction, guards, guard, to_float_time(impact_time), end)
+        meeting = meet_surface(faces, get_reaction(held), guards, guard, to_float_time(impact_time), end)
         load = held.acceleration(impact_time, end)
         verdict = judge_event(meeting, guard, reached, load, held.state, end, dt)
         state = respond_to_event(meeting, verdict, end)
@@ -323,5 +326,7 @@ def choose_mode(flag: Array, a: ContactMode, b: ContactMode) -> ContactMode:
 
 def _choose_bracket(flag: Array, a: Bracket, b: Bracket) -> Bracket:
     """Lane by lane the bracket a where flagged, else b."""
-    numbers = [jnp.where(flag, x, y) for x, y in zip(a[:-1], b[:-1], strict=True)]
-    return Bracket(*numbers, jnp.where(flag[None], a.watched, b.watched))
+    numbers = Bracket(
+        *(jnp.where(flag, x, y) for x, y in zip(a._replace(watched=flag), b._replace(watched=flag), strict=True))
+    )
+    return numbers._replace(watched=jnp.where(flag[None], a.watched, b.watched))

@@ -125,8 +125,12 @@ class Surfaces(eqx.Module):
         if all(get(stack.part) is None for stack in self.stacks):
             return None
         absent = lambda part: jnp.zeros_like(part.restitution)  # noqa: E731
-        own = lambda part: absent(part) if get(part) is None else get(part)  # noqa: E731
-        return map_stacks(lambda part: jnp.broadcast_to(own(part), lanes), self.stacks)
+
+        def own(part: Any) -> Array:
+            number = get(part)
+            return jnp.broadcast_to(absent(part) if number is None else number, lanes)
+
+        return map_stacks(own, self.stacks)
 
     def _mark(self, says: Callable[[Any], bool]) -> np.ndarray:
         return np.concatenate([np.full(len(stack.places), says(stack.part)) for stack in self.stacks])

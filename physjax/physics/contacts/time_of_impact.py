@@ -6,12 +6,12 @@ by lane, and of many lanes only those that meet something are computed again.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from physjax.backend import MIN_LANES_TO_SELECT, any_lane, compact_and_apply, materialise_where
 from physjax.loops import Time, to_float_time
@@ -20,7 +20,7 @@ from physjax.parts import holds_user_code
 from physjax.physics.contacts.contact_mode import ContactMode, decide_contact_mode, make_free_mode, start_leg
 from physjax.physics.contacts.legs import Flight, Motion, choose_lanes, has_moved_over, invalidate_lanes
 from physjax.physics.contacts.replay import log_events, replay_step
-from physjax.physics.contacts.search import find_events
+from physjax.physics.contacts.search import Leg, Progress, find_events
 from physjax.physics.contacts.surfaces import Surfaces
 from physjax.replays import differentiate_by_replay, hoist_closures
 from physjax.scene import Scene, trace_once
@@ -79,61 +79,73 @@ def _step_in_contact(motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, 
 
     held, _ = start_leg(scene, surfaces, mode := materialise_where(touches, decide, make_free_mode(scene, surfaces)), t)
     # where no lane is in contact, a step without branches for reactions; and what a branch returns is computed once
-    end = lax.cond(
-        any_lane(mode.pressed), lambda: motion(held, t, dt).state, lambda: motion(scene, t, dt).state
-    )
+    end = lax.cond(any_lane(mode.pressed), lambda: motion(held, t, dt).state, lambda: motion(scene, t, dt).state)
     return end, jnp.where(mode.pressed, since, jnp.inf)
+
+
+class _Passage(NamedTuple):
+    """A step of lanes that may meet something: `changing` is what they have if they do not."""
+
+    motion: Motion
+    changing: tuple[Particles, Array]
+    meets: Array
+    scene: Scene
+    surfaces: Surfaces
+    t: Time
+    dt: Array
 
 
 def _step_through_contacts(
     motion: Motion, changing: tuple[Particles, Array], meets: Array, scene: Scene, t: Time, dt: Array
 ) -> tuple[Particles, Array]:
     """The step, leg by leg from impact to impact, of lanes that may meet something; the others have arrived."""
-    surfaces = _collect_surfaces(scene)
-    arguments = (motion, changing, meets, scene, surfaces, t, dt)
+    passage = _Passage(motion, changing, meets, scene, _collect_surfaces(scene), t, dt)
     if holds_user_code((motion, scene)):
-        return hoist_closures(_move_once, _find_end, _log_end, _replay_end, *arguments)
-    return differentiate_by_replay(_find_end, _log_end, _replay_end, *arguments)
+        return hoist_closures(_call_functions, _find_end, _log_end, _replay_end, passage)
+    return differentiate_by_replay(_find_end, _log_end, _replay_end, passage)
 
 
-def _move_once(motion, changing, meets, scene, surfaces, t, dt):
+def _call_functions(passage: _Passage) -> PyTree:
     """What calls every function of a user: the motion, and the distances to the surfaces."""
+    motion, _, _, scene, surfaces, t, dt = passage
     return motion(scene, t, dt).state, surfaces.measure(to_float_time(t), scene.state)
 
 
-def _find_end(motion, changing, meets, scene, surfaces, t, dt):
+def _find_end(passage: _Passage) -> tuple[Particles, Array]:
     """State and begin of contact after the step, found without derivatives."""
+    motion, _, meets, scene, surfaces, t, dt = passage
     progress, _ = find_events(motion, scene, surfaces, t, dt, meets, lambda nothing, *_: nothing, ())
-    return _finish(changing, meets, scene, surfaces, t, dt, progress)
+    return _finish(passage, progress)
 
 
-def _log_end(motion, changing, meets, scene, surfaces, t, dt):
+def _log_end(passage: _Passage) -> tuple[tuple[Particles, Array], tuple[Array, Leg]]:
     """The same, and a record for the replay."""
+    motion, _, meets, scene, surfaces, t, dt = passage
     progress, legs = log_events(motion, scene, surfaces, t, dt, meets)
-    return _finish(changing, meets, scene, surfaces, t, dt, progress), (progress.legs, legs)
+    return _finish(passage, progress), (progress.legs, legs)
 
 
-def _replay_end(flown, motion, changing, meets, scene, surfaces, t, dt):
+def _replay_end(flown: tuple[Array, Leg], passage: _Passage) -> tuple[Particles, Array]:
     """The same by a replay, differentiable; zero instead of infinite where there is no contact."""
+    motion, changing, meets, scene, surfaces, t, dt = passage
     state, since, _ = replay_step(motion, scene, surfaces, t, dt, flown, lambda nothing, _: nothing, ())
     since = jnp.where(meets[None], since, changing[1])
     return choose_lanes(meets, state, changing[0]), jnp.where(jnp.isfinite(since), since, 0.0)
 
 
-def _finish(changing, meets, scene, surfaces, t, dt, progress) -> tuple[Particles, Array]:
+def _finish(passage: _Passage, progress: Progress) -> tuple[Particles, Array]:
     """The lanes after a step; those that wait where a surface has moved over them become NaN."""
-    if not surfaces.moves.any():
-        state = progress.state
-        return choose_lanes(meets, state, changing[0]), jnp.where(meets[None], progress.since, changing[1])
-    waits = meets & ~progress.arrived
+    (_, changing, meets, _, surfaces, t, dt), state = passage, progress.state
+    if surfaces.moves.any():
+        waits = meets & ~progress.arrived
 
-    def overrun() -> Array:
-        now, state = to_float_time(t + progress.elapsed), progress.state
-        faces, x = surfaces.facing(now, state.position), state.position
-        before, after = faces.signed_distance(now, x), faces.signed_distance(to_float_time(t + dt), x)
-        return waits & jnp.any(has_moved_over(before, after, x[None]), axis=0)
+        def overrun() -> Array:
+            now, x = to_float_time(t + progress.elapsed), progress.state.position
+            faces = surfaces.facing(now, x)
+            before, after = faces.signed_distance(now, x), faces.signed_distance(to_float_time(t + dt), x)
+            return waits & jnp.any(has_moved_over(before, after, x[None]), axis=0)
 
-    state = invalidate_lanes(materialise_where(waits, overrun), progress.state)
+        state = invalidate_lanes(materialise_where(waits, overrun), state)
     return choose_lanes(meets, state, changing[0]), jnp.where(meets[None], progress.since, changing[1])
 
 
