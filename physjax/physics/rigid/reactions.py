@@ -94,7 +94,7 @@ def _solve_resting_impulses(
         turning, _ = point_state.turning
         faster = faster + scale(dot(turning, points.velocity), points.normal)
     velocity = points.velocity + scale(jnp.broadcast_to(ahead, on.shape), faster)
-    return apply_contact_impulses(points._replace(velocity=velocity), on, state, mass)
+    return apply_contact_impulses(points._replace(velocity=velocity), on, state, mass)[:2]
 
 
 def _correct_penetration(state: RigidBodies, point_state: ContactPointState, pressed: Array) -> RigidBodies:
