@@ -2,7 +2,8 @@
 
 The search finds without derivatives when bodies strike. With these times the step is a short scan over its legs. The moment
 of an impact is h - d(h)/s, with d the distance of the lowest point on the method's own step, and s its derivative by h, which
-is held: the value is only rounded anew, but it moves with all that d depends on.
+is held: the value is only rounded anew, but it moves with all that d depends on. By differences s is off by a share ε, and
+the derivatives by ε²: the second pass corrects the first.
 """
 
 from collections.abc import Callable
@@ -129,22 +130,30 @@ def _fly_leg(
 
 
 def _find_moment(fly: Callable, h: Array, strikes: Array, ends: Array) -> tuple[Array, RigidBodies, ContactPointState]:
-    """The durations with their derivatives, and the bodies and points after them."""
+    """The durations with their derivatives, and the bodies and points after them.
 
-    def approach(h: Array) -> tuple[Array, tuple[RigidBodies, ContactPointState]]:
-        (distance, there), (slope, _) = jax.jvp(partial(fly, ends), (h,), (jnp.ones_like(h),))
-        slope = lax.stop_gradient(slope)
-        falls = strikes & (slope < 0)
-        return jnp.where(falls, h - distance / jnp.where(falls, slope, 1.0), h), there
+    The first two of the loop's passes look a little before and after the moment, for the distance's derivative by h; the
+    next are Newton's. In one loop the motion stands once; without an impact its last pass is enough.
+    """
+    nowhere = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fly, ends, h))
+    offset = float(jnp.finfo(h.dtype).eps) ** (1 / 3) * h
+    passes = 2 + NEWTON_PASSES + 1
 
-    shapes = jax.eval_shape(lambda: approach(h)[1])
-    nowhere = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    def pass_(carry: tuple, number: Array) -> tuple[tuple, None]:
+        def look(h: Array, slope: Array) -> tuple:
+            before, after = number == 0, number == 1
+            here = h + jnp.where(before, -offset, jnp.where(after, offset, 0.0))
+            distance, there = fly(ends, here)
+            # before the moment the distance itself is kept, after it the two make the derivative
+            measured = lax.stop_gradient(
+                jnp.where(before, distance, (distance - slope) / jnp.where(strikes, 2 * offset, 1.0))
+            )
+            falls = strikes & (slope < 0) & (number > 1) & (number < passes - 1)
+            h = jnp.where(falls, h - distance / jnp.where(falls, slope, 1.0), h)
+            return h, jnp.where(number < 2, measured, slope), (distance, there)
 
-    # one loop, so that the motion stands in it once; without an impact its last pass is enough
-    def pass_(carry: tuple, last: Array) -> tuple[tuple, None]:
-        h, _, there = carry
-        after, there = lax.cond(last | any_lane(strikes), approach, lambda h: (h, there), h)
-        return (after, h, there), None
+        skip = lambda h, slope: (h, slope, carry[-1])  # noqa: E731
+        return lax.cond((number == passes - 1) | any_lane(strikes), look, skip, *carry[:-1]), None
 
-    (_, h, there), _ = lax.scan(pass_, (h, h, nowhere), jnp.arange(NEWTON_PASSES + 1) == NEWTON_PASSES)
+    (h, _, (_, there)), _ = lax.scan(pass_, (h, jnp.zeros_like(h), nowhere), jnp.arange(passes))
     return h, *there
