@@ -21,11 +21,11 @@ from physjax.physics.contacts.events import Dip
 from physjax.physics.contacts.legs import MAX_IMPACTS, Motion, choose_lanes, shortest_duration
 from physjax.physics.rigid.point_contacts import (
     ContactKind,
+    count_points,
     face_surfaces,
     find_dips,
-    gather_point_states,
 )
-from physjax.physics.rigid.reactions import Leg, Stage, exchange_impulses, move_with_reactions, start_leg
+from physjax.physics.rigid.reactions import Leg, Place, Stage, exchange_impulses, move_with_reactions, start_leg
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 
@@ -119,11 +119,11 @@ def find_impacts(
     """
     progress, dt = start_progress(scene, dt)
     scene = scene.replace(state=progress.state)
-    first = jax.eval_shape(lambda: gather_point_states(kinds, t, scene.state, scene.mass))
-    zero, no = jnp.zeros_like(dt), jnp.zeros(dt.shape, bool)
+    points, zero, no = count_points(kinds), jnp.zeros_like(dt), jnp.zeros(dt.shape, bool)
+    nowhere = jnp.zeros((points, *scene.state.position.shape), scene.state.dtype)
     start = _Search(
-        leg=start_leg(scene.state, first.signed_distance.shape[0]),
-        center=Particles(*(jnp.zeros(leaf.shape, leaf.dtype) for leaf in first.center)),
+        leg=start_leg(scene.state, points),
+        center=Particles(nowhere, nowhere),
         elapsed=zero,
         begins=~no,
         seeks=no,
@@ -162,13 +162,13 @@ def _take_turn(
 
     state, now = materialise_where(tries | seeks, move, leg.before), leg_start + h
     facing = face_surfaces(kinds, leg_start, leg.before)
-    point_state = gather_point_states(facing, now, state, scene.mass)
-    lowest = jnp.min(jnp.where(leg.on, jnp.inf, point_state.signed_distance), axis=0)
+    here = Place.find(facing, now, state, scene.mass)
+    lowest = jnp.min(jnp.where(leg.on, jnp.inf, here.points.signed_distance), axis=0)
     tolerance = ROOT_ROUNDING * float(jnp.finfo(rest.dtype).eps) * rest
     narrower, found = search.bracket.narrow(lowest, tolerance)
     stage = Stage(begins, tries, seeks & found)
-    met = exchange_impulses(scene, leg, stage, (point_state, state, now), (dt, rest))
-    center = choose_lanes(begins[None], point_state.center, search.center)
+    met = exchange_impulses(scene, leg, stage, here, (dt, rest))
+    center = choose_lanes(begins[None], here.points.center, search.center)
     bracket, hit = _bracket_impact(facing, met.leg.on, (center, met.center), leg_start, rest, tries)
     ends = tries & ~hit
     before = choose_lanes(stage.strikes, met.struck, choose_lanes(ends, met.held, leg.before))

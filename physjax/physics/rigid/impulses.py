@@ -14,14 +14,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from physjax.backend import any_lane, bounded_while_loop
-from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import RigidBodies, apply_inverse_inertia
+from physjax.physics.rigid.mobility import Mobility
+from physjax.physics.rigid.spatial import RigidBodies
 from physjax.vectors import add_leading_axes, square_root
 
 MAX_SWEEPS = 256
@@ -71,7 +70,7 @@ def apply_contact_impulses(
     points: Points,
     active: Bool[Array, "points *lanes"],
     bodies: RigidBodies,
-    inertia: Inertia,
+    mobility: Mobility,
     restitution: Float[Array, "points *lanes"] | None = None,
     struck: Bool[Array, "*lanes"] | None = None,
 ) -> Impact:
@@ -92,7 +91,7 @@ def apply_contact_impulses(
         # in an impact sticking is limited by μ_k as well: discs that shrink from μ_s to μ_k could add energy
         static, kinetic = points.friction
         points = points._replace(friction=(jnp.where(struck[None], kinetic, static), kinetic))
-    body = _build_body(bodies, inertia)
+    body = _build_body(mobility)
     rows = _build_rows(points, active, body)
     bounce = None if restitution is None else _flatten_numbers(restitution)
     collides = None if struck is None else struck.reshape(1, -1)
@@ -142,12 +141,9 @@ class _Body(NamedTuple):
     inverse_inertia: Array
 
 
-def _build_body(bodies: RigidBodies, inertia: Inertia) -> _Body:
-    """Inverse mass and inertia in the layout of the sweeps: the tensor's columns are what it makes of the three axes."""
-    axes = jnp.eye(3, dtype=bodies.dtype).reshape(3, *(1,) * len(bodies.lanes), 3)
-    axes = jnp.broadcast_to(axes, (3, *bodies.position.shape))
-    inverse_inertia = _flatten_vectors(jax.vmap(lambda axis: apply_inverse_inertia(bodies, inertia, axis))(axes))
-    return _Body(jnp.broadcast_to(1 / inertia.mass, bodies.lanes).reshape(1, -1), inverse_inertia)
+def _build_body(mobility: Mobility) -> _Body:
+    """The mobility in the layout of the sweeps."""
+    return _Body(mobility.inverse_mass.reshape(1, -1), _flatten_vectors(jnp.stack(mobility.columns)))
 
 
 def _flatten_vectors(vectors: Array) -> Array:

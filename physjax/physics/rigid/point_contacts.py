@@ -20,7 +20,6 @@ from physjax.physics.contacts.events import Dip, find_dip
 from physjax.physics.contacts.face import LowestPoint
 from physjax.physics.rigid.contact_points import ContactPoints
 from physjax.physics.rigid.impulses import Points
-from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 from physjax.stacks import stack_alike
@@ -62,9 +61,14 @@ class PointContact(Contact):
     def narrow(self) -> bool:
         """Whether a fast point may pass through the surface and out again within a step."""
 
+    @property
     @abstractmethod
-    def point_state(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> ContactPointState:
-        """The points of the hull at the surface."""
+    def moves(self) -> bool:
+        """Whether the surface may be elsewhere at another time."""
+
+    @abstractmethod
+    def point_state(self, t: ArrayLike, bodies: RigidBodies, velocities: tuple[Array, Array]) -> ContactPointState:
+        """The points of the hull at the surface, of bodies with these velocities v and ω."""
 
     @abstractmethod
     def walls(self) -> tuple["PointContact", ...]:
@@ -131,14 +135,19 @@ def face_surfaces(kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies) -
     return tuple(kind.facing(t, state) for kind in kinds)
 
 
+def count_points(kinds: tuple[ContactKind, ...]) -> int:
+    """How many points all contacts together have."""
+    return sum(kind.count * kind.contact.hull.points.shape[-2] for kind in kinds)
+
+
 def gather_point_states(
-    kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies, inertia: Inertia
+    kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies, velocities: tuple[Array, Array]
 ) -> ContactPointState:
     """Every point of every hull at its surface, joined along the axis of points.
 
     What only some surfaces have, curvature or friction, is zero at the others.
     """
-    locate = lambda contact: contact.point_state(to_float_time(t), state, inertia)  # noqa: E731
+    locate = lambda contact: contact.point_state(to_float_time(t), state, velocities)  # noqa: E731
     parts = [locate(kind.contact) if kind.count == 1 else _join_contacts(kind.map(locate)) for kind in kinds]
     if len(parts) == 1:
         return parts[0]

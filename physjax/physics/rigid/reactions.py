@@ -18,8 +18,15 @@ from physjax.particles import Particles
 from physjax.physics.contacts.legs import SHORTEST_FLIGHT_SHARE, Motion, Tree, choose_lanes
 from physjax.physics.rigid.impulses import Impact, Points, apply_contact_impulses
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.point_contacts import ContactPointState, find_resting_points, find_touching_points
-from physjax.physics.rigid.spatial import RigidBodies, WholeWrench, angular_acceleration, angular_velocity
+from physjax.physics.rigid.mobility import Mobility
+from physjax.physics.rigid.point_contacts import (
+    ContactKind,
+    ContactPointState,
+    find_resting_points,
+    find_touching_points,
+    gather_point_states,
+)
+from physjax.physics.rigid.spatial import RigidBodies, WholeWrench
 from physjax.scene import Scene
 from physjax.vectors import cross, dot, norm, scale
 
@@ -31,7 +38,7 @@ Thrust = tuple[Array, Array]
 
 
 class Leg(NamedTuple):
-    """A leg of a step as it began: the bodies, the reactions through it, which points stay, and the speed that loads give.
+    """A leg of a step as it began: the bodies, the reactions through it, which points stay, and which bodies are at rest.
 
     `load_speed` [m/s] is what the loads give in a whole step: the measure of small speeds and distances.
     """
@@ -39,6 +46,7 @@ class Leg(NamedTuple):
     before: RigidBodies
     thrust: Thrust
     on: Bool[Array, "points *lanes"]
+    rests: Bool[Array, "*lanes"]
     load_speed: Array
 
 
@@ -48,6 +56,21 @@ class Stage(NamedTuple):
     begins: Bool[Array, "*lanes"]
     arrives: Bool[Array, "*lanes"]
     strikes: Bool[Array, "*lanes"]
+
+
+class Place(NamedTuple):
+    """Bodies at a time t, how easily they are moved there, and their points at the surfaces."""
+
+    t: Time
+    state: RigidBodies
+    mobility: Mobility
+    points: ContactPointState
+
+    @classmethod
+    def find(cls, kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies, inertia: Inertia) -> "Place":
+        """Where bodies are at a time t."""
+        mobility = Mobility.of(state, inertia)
+        return cls(t, state, mobility, gather_point_states(kinds, t, state, mobility.velocities(state)))
 
 
 class Meeting(NamedTuple):
@@ -66,7 +89,7 @@ def start_leg(state: RigidBodies, points: int) -> Leg:
     """A leg of which nothing is known yet but where the bodies are."""
     zero = jnp.zeros(state.lanes, state.dtype)
     thrust = (jnp.zeros_like(state.momentum), jnp.zeros_like(state.momentum))
-    return Leg(state, thrust, jnp.zeros((points, *state.lanes), bool), zero)
+    return Leg(state, thrust, jnp.zeros((points, *state.lanes), bool), jnp.zeros(state.lanes, bool), zero)
 
 
 def take_shared_number(scene: Scene, number: Tree) -> Tree:
@@ -86,47 +109,55 @@ def apply_half_impulse(state: RigidBodies, thrust: Thrust, h: Array) -> RigidBod
     return RigidBodies(x, q, p + scale(h / 2, thrust[0]), spin + scale(h / 2, thrust[1]))
 
 
-def exchange_impulses(
-    scene: Scene, leg: Leg, stage: Stage, here: tuple[ContactPointState, RigidBodies, Time], times: tuple[Array, Array]
-) -> Meeting:
+def exchange_impulses(scene: Scene, leg: Leg, stage: Stage, here: Place, times: tuple[Array, Array]) -> Meeting:
     """The impulses at the points of bodies that are `here`, in a step dt of which a time is left (`times`) [s].
 
     As a leg begins they are what keeps the points from going in by its middle; half of the reaction. As it ends they are
     whatever keeps them from going in now: that half is solved again and is not the first.
     """
-    (point_state, state, t), (dt, rest), mass = here, times, scene.mass
-    load = state.generalised_force(scene, t)
+    state, point_state, (dt, rest) = here.state, here.points, times
+    load = state.generalised_force(scene, here.t)
     # what stays and what touches are choices, which have no derivatives
     measured = lax.stop_gradient((point_state, state))
-    load_speed = jnp.where(stage.begins, lax.stop_gradient(dt * norm(load[0]) / mass.mass), leg.load_speed)
+    load_speed = jnp.where(
+        stage.begins, lax.stop_gradient(dt * norm(load[0]) * here.mobility.inverse_mass), leg.load_speed
+    )
     on = jnp.where(stage.begins[None], find_resting_points(*measured, load_speed, dt), leg.on)
     touching = find_touching_points(*measured, load_speed, dt)
     active = jnp.where(stage.strikes[None], touching, on & (stage.begins | stage.arrives)[None])
     ahead = jnp.where(stage.begins, rest / 2, 0.0)
 
     def solve() -> Impact:
-        points = _advance_points(point_state, state, load, mass, ahead)
+        points = _advance_points(here, load, ahead)
         restitution = _find_restitution(point_state, stage.strikes, load_speed)
-        return apply_contact_impulses(points, active, state, mass, restitution, stage.strikes)
+        return apply_contact_impulses(points, active, state, here.mobility, restitution, stage.strikes)
 
     zero = jnp.zeros_like(state.momentum)
     impact = materialise_where(active, solve, Impact(state, jnp.zeros_like(point_state.signed_distance), (zero, zero)))
     gained = impact.bodies.momentum - state.momentum, impact.bodies.angular_momentum - state.angular_momentum
     thrust = choose_lanes(stage.begins, tuple(scale(2 / rest, part) for part in gained), leg.thrust)
-    leg = Leg(leg.before, thrust, on, load_speed)
-    return Meeting(leg, *_finish_leg(scene, leg, impact, point_state, state), impact.bodies)
+    leg = Leg(leg.before, thrust, on, leg.rests, load_speed)
+    held, center = _push_out(leg, impact, here)
+    # by energy, which sees rotation as well; at both ends, so that a body that turns back is not taken for one at rest
+    slow = scene.mass.mass * (BODY_AT_REST_SPEED_SHARE * load_speed) ** 2
+    ends = choose_lanes(stage.begins, (state.momentum, state.angular_momentum), (held.momentum, held.angular_momentum))
+    slow = 2 * here.mobility.kinetic_energy(RigidBodies(*state[:2], *ends)) <= slow
+    still = leg.before.hold_lanes(jnp.zeros_like(load_speed))
+    some = jnp.any(on, axis=0)
+    held = choose_lanes(some, choose_lanes(leg.rests & slow, still, held), state)
+    return Meeting(leg._replace(rests=jnp.where(stage.begins, slow, leg.rests)), held, center, impact.bodies)
 
 
-def _advance_points(
-    point_state: ContactPointState, state: RigidBodies, load: WholeWrench, mass: Inertia, ahead: Array
-) -> Points:
+def _advance_points(here: Place, load: WholeWrench, ahead: Array) -> Points:
     """The points with the velocities that they will have a time `ahead` [s].
 
     A point's acceleration is that of the free body: a + ω̇ × r + ω × (velocity of r). On curved ground the normal turns
     as well, which adds ṅ·v along it.
     """
+    _, state, mobility, point_state = here
     points, (force, torque) = point_state.points, load
-    omega, change = angular_velocity(state, mass), angular_acceleration(state, mass, torque)
+    _, omega = mobility.velocities(state)
+    change = mobility.turn(torque - cross(omega, state.angular_momentum))
     spread = lambda vector: jnp.broadcast_to(vector, points.arm.shape)  # noqa: E731
     # the point of a rolling ball that touches is always another: only the center of the radius turns with the body
     moves = cross(spread(omega), point_state.center.position - spread(state.position))
@@ -134,7 +165,9 @@ def _advance_points(
         # over curved ground the point that touches moves around that center as the normal turns
         turning, radius = point_state.turning
         moves = moves - scale(radius, turning)
-    faster = spread(scale(1 / mass.mass, force)) + cross(spread(change), points.arm) + cross(spread(omega), moves)
+    faster = (
+        spread(scale(mobility.inverse_mass, force)) + cross(spread(change), points.arm) + cross(spread(omega), moves)
+    )
     if point_state.turning is not None:
         turning, _ = point_state.turning
         faster = faster + scale(dot(turning, points.velocity), points.normal)
@@ -148,22 +181,14 @@ def _find_restitution(point_state: ContactPointState, strikes: Array, load_speed
     return jnp.where(strikes[None] & ~last, point_state.restitution, 0.0)
 
 
-def _finish_leg(
-    scene: Scene, leg: Leg, impact: Impact, point_state: ContactPointState, end: RigidBodies
-) -> tuple[RigidBodies, Particles]:
-    """The bodies put onto what carries them, and the centers of their points; those at rest keep the place they had."""
-    held, (faster, spun), center = impact.bodies, impact.change, point_state.center
-    shift = _find_penetration(point_state, leg.on & (impact.push > 0))
-    held, spread = held._replace(position=held.position - shift), lambda v: jnp.broadcast_to(v, center.position.shape)
-    turned = cross(spread(spun), center.position - spread(end.position))
+def _push_out(leg: Leg, impact: Impact, here: Place) -> tuple[RigidBodies, Particles]:
+    """The bodies after the impulses, put onto what carries them, and the centers of their points then."""
+    held, (faster, spun), center = impact.bodies, impact.change, here.points.center
+    shift = _find_penetration(here.points, leg.on & (impact.push > 0))
+    spread = lambda vector: jnp.broadcast_to(vector, center.position.shape)  # noqa: E731
+    turned = cross(spread(spun), center.position - spread(held.position))
     center = Particles(center.position - spread(shift), center.velocity + spread(faster) + turned)
-    # by energy, which sees rotation as well; at both ends, so that a body that turns back is not taken for one at rest
-    slow = scene.mass.mass * (BODY_AT_REST_SPEED_SHARE * leg.load_speed) ** 2
-    both = jax.tree.map(lambda *ends: jnp.stack(ends), leg.before, held)
-    rests = jnp.all(2 * jax.vmap(lambda state: state.kinetic_energy(scene.mass))(both) <= slow[None], axis=0)
-    still = leg.before.hold_lanes(jnp.zeros_like(leg.load_speed))
-    some = jnp.any(leg.on, axis=0)
-    return choose_lanes(some, choose_lanes(rests, still, held), end), center
+    return held._replace(position=held.position - shift), center
 
 
 def _find_penetration(point_state: ContactPointState, pressed: Array) -> Array:

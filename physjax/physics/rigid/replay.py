@@ -20,9 +20,10 @@ from physjax.backend import any_lane
 from physjax.loops import Time
 from physjax.physics.contacts.legs import Flight, Motion, choose_lanes
 from physjax.physics.rigid.impact_search import MAX_LEGS, Progress, split_remaining_step, start_progress
-from physjax.physics.rigid.point_contacts import ContactKind, ContactPointState, face_surfaces, gather_point_states
+from physjax.physics.rigid.point_contacts import ContactKind, count_points, face_surfaces
 from physjax.physics.rigid.reactions import (
     Leg,
+    Place,
     Stage,
     apply_half_impulse,
     exchange_impulses,
@@ -30,7 +31,6 @@ from physjax.physics.rigid.reactions import (
     start_leg,
     take_shared_number,
 )
-from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 
 NEWTON_PASSES = 2
@@ -62,7 +62,6 @@ def replay_step(
     `durations` are `(legs, *lanes)` and infinite where a leg reaches the end of the step.
     """
     progress, dt = start_progress(scene, dt)
-    points = jax.eval_shape(lambda: gather_point_states(kinds, t, scene.state, scene.mass)).signed_distance.shape[0]
     add, total = (None, None) if observe is None else observe
 
     # reverse mode computes each half of a leg again: storing what it needs of one costs more than the work
@@ -77,7 +76,7 @@ def replay_step(
 
     # a leg has two halves, in which impulses act: as it begins, and as it ends
     halves = jnp.repeat(durations, 2, axis=0), jnp.arange(2 * MAX_LEGS) % 2 == 1
-    start = _Replay(start_leg(scene.state, points), progress.elapsed, progress.arrived)
+    start = _Replay(start_leg(scene.state, count_points(kinds)), progress.elapsed, progress.arrived)
     (end, total), _ = lax.scan(go_on, (start, total), halves)
     return Progress(end.elapsed, end.leg.before, end.arrived), total
 
@@ -101,14 +100,14 @@ def _take_half_leg(
     strikes = going & ends & jnp.isfinite(duration)
     h = jnp.where(ends, jnp.where(strikes, duration, rest), 0.0)
     fly = partial(_fly_leg, motion, scene, facing, leg, leg_start)
-    h, state, point_state = _find_moment(fly, h, strikes, ends)
+    h, here = _find_moment(fly, h, strikes, ends)
     stage = Stage(going & ~ends, going & ends & ~strikes, strikes)
-    met = exchange_impulses(scene, leg, stage, (point_state, state, leg_start + h), (dt, rest))
+    met = exchange_impulses(scene, leg, stage, here, (dt, rest))
     after = choose_lanes(strikes, met.struck, choose_lanes(stage.arrives, met.held, leg.before))
     if add is not None:
         start = scene.replace(state=apply_half_impulse(leg.before, leg.thrust, h))
         shared = partial(take_shared_number, scene)
-        flight = Flight(leg.before, start, shared(leg_start), shared(h), state, after, going)
+        flight = Flight(leg.before, start, shared(leg_start), shared(h), here.state, after, going)
         total = lax.cond(ends, lambda: add(total, flight), lambda: total)
     elapsed = replay.elapsed + jnp.where(going, h, 0.0)
     return _Replay(met.leg._replace(before=after), elapsed, replay.arrived | stage.arrives), total
@@ -122,15 +121,15 @@ def _fly_leg(
     leg_start: Time,
     ends: Array,
     h: Array,
-) -> tuple[Array, tuple[RigidBodies, ContactPointState]]:
-    """The distance of the lowest point that does not rest [m] after a time h [s], and the bodies and their points there."""
+) -> tuple[Array, Place]:
+    """The distance of the lowest point that does not rest [m] after a time h [s], and where the bodies are then."""
     state = lax.cond(ends, lambda h: move_with_reactions(motion, scene, leg, leg_start, h), lambda _: leg.before, h)
-    point_state = gather_point_states(kinds, leg_start + h, state, scene.mass)
-    return jnp.min(jnp.where(leg.on, jnp.inf, point_state.signed_distance), axis=0), (state, point_state)
+    there = Place.find(kinds, leg_start + h, state, scene.mass)
+    return jnp.min(jnp.where(leg.on, jnp.inf, there.points.signed_distance), axis=0), there
 
 
-def _find_moment(fly: Callable, h: Array, strikes: Array, ends: Array) -> tuple[Array, RigidBodies, ContactPointState]:
-    """The durations with their derivatives, and the bodies and points after them.
+def _find_moment(fly: Callable, h: Array, strikes: Array, ends: Array) -> tuple[Array, Place]:
+    """The durations with their derivatives, and where the bodies are after them.
 
     The first two of the loop's passes look a little before and after the moment, for the distance's derivative by h; the
     next are Newton's. In one loop the motion stands once; without an impact its last pass is enough.
@@ -156,4 +155,4 @@ def _find_moment(fly: Callable, h: Array, strikes: Array, ends: Array) -> tuple[
         return lax.cond((number == passes - 1) | any_lane(strikes), look, skip, *carry[:-1]), None
 
     (h, _, (_, there)), _ = lax.scan(pass_, (h, jnp.zeros_like(h), nowhere), jnp.arange(passes))
-    return h, *there
+    return h, there

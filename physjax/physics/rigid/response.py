@@ -23,13 +23,14 @@ from physjax.physics.contacts.legs import OVERRUN_ROUNDING, Flight, Motion, choo
 from physjax.physics.rigid.impact_search import Progress, find_impacts
 from physjax.physics.rigid.point_contacts import (
     ContactKind,
+    count_points,
     face_surfaces,
     find_dips,
-    gather_point_states,
     stack_body_contacts,
 )
 from physjax.physics.rigid.reactions import (
     Leg,
+    Place,
     Stage,
     apply_half_impulse,
     exchange_impulses,
@@ -152,13 +153,16 @@ def _invalidate_overrun_lanes(
     kinds: tuple[ContactKind, ...], progress: Progress, t: Time, dt: ArrayLike
 ) -> RigidBodies:
     """The bodies after a step; those that wait where a surface has moved over them become NaN."""
+    moving = tuple(kind for kind in kinds if kind.contact.moves)
+    if not moving:
+        return progress.state
 
     def find_overrun() -> Array:
         state = lax.stop_gradient(progress.state)
         leg_start, end = to_float_time(t + progress.elapsed), to_float_time(t + dt)
         rounding = OVERRUN_ROUNDING * float(jnp.finfo(state.dtype).eps) * norm(state.position)
         over = jnp.zeros(rounding.shape, bool)
-        for kind in face_surfaces(kinds, leg_start, state):
+        for kind in face_surfaces(moving, leg_start, state):
             before, after = (kind.map(lambda contact, t=t: contact.clearance(t, state)) for t in (leg_start, end))
             over = over | jnp.any((after < -rounding[None]) & (after < before - rounding[None]), axis=0)
         return over & ~progress.arrived
@@ -173,7 +177,6 @@ def _resolve_at_step_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -
     """
     dt = jnp.broadcast_to(dt, scene.state.lanes)
     kinds = face_surfaces(stack_body_contacts(scene), t, scene.state)
-    points = jax.eval_shape(lambda: gather_point_states(kinds, t, scene.state, scene.mass)).signed_distance.shape[0]
     narrow = any(kind.contact.narrow for kind in kinds)
 
     def act(carry: tuple[Leg, RigidBodies], part: Array) -> tuple[tuple[Leg, RigidBodies], tuple | None]:
@@ -182,14 +185,14 @@ def _resolve_at_step_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -
         move = lambda: move_with_reactions(motion, scene, leg, t, dt)  # noqa: E731
         state = lax.cond(any_lane(flags[ARRIVES]), move, lambda: state)
         now = t + jnp.where(flags[BEGINS], 0.0, dt)
-        point_state = gather_point_states(kinds, now, state, scene.mass)
-        met = exchange_impulses(scene, leg, Stage(*flags), (point_state, state, now), (dt, dt))
+        here = Place.find(kinds, now, state, scene.mass)
+        met = exchange_impulses(scene, leg, Stage(*flags), here, (dt, dt))
         after = choose_lanes(flags[STRIKES], met.struck, choose_lanes(flags[ARRIVES], met.held, state))
-        path = (point_state.center, point_state.signed_distance) if narrow else None
+        path = (here.points.center, here.points.signed_distance) if narrow else None
         return (met.leg, after), lax.stop_gradient(path)
 
     parts = jnp.array([BEGINS, ARRIVES, STRIKES])
-    (leg, struck), path = lax.scan(act, (start_leg(scene.state, points), scene.state), parts)
+    (leg, struck), path = lax.scan(act, (start_leg(scene.state, count_points(kinds)), scene.state), parts)
     for kind in kinds:
         struck = _move_out(kind, to_float_time(t + dt), struck)
     if path is None:
