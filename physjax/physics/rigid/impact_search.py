@@ -25,7 +25,15 @@ from physjax.physics.rigid.point_contacts import (
     face_surfaces,
     find_dips,
 )
-from physjax.physics.rigid.reactions import Leg, Place, Stage, exchange_impulses, move_with_reactions, start_leg
+from physjax.physics.rigid.reactions import (
+    Leg,
+    Meeting,
+    Place,
+    Stage,
+    exchange_impulses,
+    move_with_reactions,
+    start_leg,
+)
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 
@@ -92,6 +100,7 @@ class _Search(NamedTuple):
     elapsed: Array
     begins: Bool[Array, "*lanes"]
     seeks: Bool[Array, "*lanes"]
+    found: Bool[Array, "*lanes"]
     arrived: Bool[Array, "*lanes"]
     impacts: Int[Array, "*lanes"]
     bracket: Bracket
@@ -127,6 +136,7 @@ def find_impacts(
         elapsed=zero,
         begins=~no,
         seeks=no,
+        found=no,
         arrived=progress.arrived,
         impacts=jnp.zeros(dt.shape, jnp.int32),
         bracket=Bracket(zero, zero, zero, zero, zero),
@@ -165,12 +175,20 @@ def _take_turn(
     here = Place.find(facing, now, state, scene.mass)
     lowest = jnp.min(jnp.where(leg.on, jnp.inf, here.points.signed_distance), axis=0)
     tolerance = ROOT_ROUNDING * float(jnp.finfo(rest.dtype).eps) * rest
-    narrower, found = search.bracket.narrow(lowest, tolerance)
-    stage = Stage(begins, tries, seeks & found)
-    met = exchange_impulses(scene, leg, stage, here, (dt, rest))
+    narrower, is_root = search.bracket.narrow(lowest, tolerance)
+    found = seeks & (search.found | is_root)
+    # who has found the time of an impact waits there until all have, so that impulses are solved for once and not many times
+    stage = Stage(begins, tries, found & ~any_lane(seeks & ~found))
+    met = materialise_where(
+        begins | tries | stage.strikes,
+        lambda: exchange_impulses(scene, leg, stage, here, (dt, rest)),
+        Meeting(leg, state, here.points.center, state),
+    )
     center = choose_lanes(begins[None], here.points.center, search.center)
     bracket, hit = _bracket_impact(facing, met.leg.on, (center, met.center), leg_start, rest, tries)
     ends = tries & ~hit
+    narrower = narrower._replace(share=jnp.where(is_root, 0.0, narrower.share))
+    bracket = choose_lanes(hit, bracket, choose_lanes(seeks & ~search.found, narrower, search.bracket))
     before = choose_lanes(stage.strikes, met.struck, choose_lanes(ends, met.held, leg.before))
     durations = search.durations
     if durations is not None:
@@ -182,10 +200,11 @@ def _take_turn(
         center=center,
         elapsed=search.elapsed + jnp.where(ends, rest, jnp.where(stage.strikes, h, 0.0)),
         begins=stage.strikes | (search.begins & ~goes_on),
-        seeks=(seeks & ~found) | hit,
+        seeks=(seeks & ~stage.strikes) | hit,
+        found=found & ~stage.strikes,
         arrived=search.arrived | ends,
         impacts=search.impacts + stage.strikes.astype(jnp.int32),
-        bracket=choose_lanes(hit, bracket, choose_lanes(seeks, narrower, search.bracket)),
+        bracket=bracket,
         durations=durations,
     )
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from physjax.backend import any_lane, bounded_while_loop
 from physjax.physics.rigid.mobility import Mobility
 from physjax.physics.rigid.spatial import RigidBodies
-from physjax.vectors import add_leading_axes, square_root
+from physjax.vectors import add_leading_axes, norm
 
 MAX_SWEEPS = 256
 """Most sweeps over all points: a single point needs two, a box on its face about twenty, near sliding a hundred."""
@@ -202,18 +202,18 @@ def _solve_fixed_point(
     """
 
     def residual(j: Array) -> Array:
-        return jnp.where(wanted, _sweep_points(rows, body, known, j, _sum_impulses(rows, j))[0], start) - j
+        return jnp.where(wanted, _sweep_points(rows, body, known, j, _sum_velocities(rows, body, j))[0], start) - j
 
     def repeat_sweeps(_, j: Array) -> Array:
-        # what the body is given is carried along, so that a point's turn costs no sum over the other points
+        # the velocity of the body is carried along, so that a point's turn costs no sum over the other points
         def pass_(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            before, given_before, going = carry
-            after, given_after = _sweep_points(rows, body, known, before, given_before)
+            before, moved_before, going = carry
+            after, moved_after = _sweep_points(rows, body, known, before, moved_before)
             # a lane that has settled waits for the others without a change: its result does not depend on theirs
             after = jnp.where(going, after, before)
-            return after, jnp.where(going[0], given_after, given_before), _find_changed_lanes(before, after)
+            return after, jnp.where(going[0], moved_after, moved_before), _find_changed_lanes(before, after)
 
-        return _repeat_until_settled(pass_, (j, _sum_impulses(rows, j), wanted))[0]
+        return _repeat_until_settled(pass_, (j, _sum_velocities(rows, body, j), wanted))[0]
 
     def solve_linear(change: Callable[[Array], Array], right: Array) -> Array:
         def pass_(carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -228,13 +228,13 @@ def _solve_fixed_point(
 
 
 def _sweep_points(
-    rows: _PointRows, body: _Body, known: tuple[Array, Array] | None, j: Array, given: Array
+    rows: _PointRows, body: _Body, known: tuple[Array, Array] | None, j: Array, moved: Array
 ) -> tuple[Array, Array]:
-    """The impulses after one sweep over the points, and the momenta `(6, lanes)` that they give to the body."""
+    """The impulses after one sweep over the points, and the velocity and ω `(6, lanes)` that they give to the body."""
     known_lanes, pushes = (None, None) if known is None else known
     # one after the other: points that took their turns at once would overshoot where they share a load
-    given, after = lax.scan(partial(_update_point, body, known_lanes), given, (rows, j, pushes))
-    return after, given
+    moved, after = lax.scan(partial(_update_point, body, known_lanes), moved, (rows, j, pushes))
+    return after, moved
 
 
 def _find_changed_lanes(before: Array, after: Array) -> Array:
@@ -249,7 +249,7 @@ def _repeat_until_settled(pass_: Callable[[tuple], tuple], start: tuple) -> tupl
 
 
 def _update_point(
-    body: _Body, known: Array | None, given: Array, point: tuple[_PointRows, Array, Array | None]
+    body: _Body, known: Array | None, moved: Array, point: tuple[_PointRows, Array, Array | None]
 ) -> tuple[Array, Array]:
     """A sweep's turn of one point, the impulses at the others given: it sticks if it can, else it is pushed and slips.
 
@@ -257,33 +257,61 @@ def _update_point(
     velocity across the normal, at most as long as the stiffest direction allows, and cuts it to the disc of μ_k.
     """
     row, old, wanted = point
-    faster, spun = _find_velocities(body, given)
-    v, pushed = row.before + faster + _cross(spun, row.arm), _dot(row.normal, old)
-    push = jnp.maximum(pushed - _dot(row.normal, v) * row.share, 0.0)
+    # vectors are (1, 3, lanes) here and numbers (1, lanes): the compiler then keeps what several components share
+    arm, normal, before, old = (vector[None] for vector in (row.arm, row.normal, row.before, old))
+    v = before + moved[None, :3] + _cross_one(moved[None, 3:], arm)
+    pushed = _dot_one(normal, old)
+    push = jnp.maximum(pushed - _dot_one(normal, v) * row.share, 0.0)
     push = push if known is None else jnp.where(known, wanted, push)
-    new = push * row.normal
+    new = push[:, None] * normal
     if row.friction is not None:
         static, kinetic = row.friction
-        stick = old - _multiply(row.inverse, v)
-        held = _dot(row.normal, stick)
+        stick = old - _multiply_one(row.inverse[None], v)
         if known is not None:
             # the normal impulse is known: the sticking impulse of that size, which leaves a normal velocity
-            lacking = jnp.where(known, push - held, 0.0)
-            stick, held = stick + lacking * row.push_direction, held + lacking
-            static = jnp.where(known, kinetic, static)
+            lacking = jnp.where(known, push - _dot_one(normal, stick), 0.0)
+            stick, static = stick + lacking[:, None] * row.push_direction[None], jnp.where(known, kinetic, static)
         # the slip after this turn's normal impulse, which moves the point across the normal as well
-        v = v + (push - pushed) * row.normal_response
-        slip = _project_across(row.normal, old - row.slip_mobility * v)
-        size, most = _norm(slip), kinetic * push
-        slip = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0) * slip
-        sticks = (held >= 0) & (_norm(stick - held * row.normal) <= static * held)
-        new = jnp.where(row.share > 0, jnp.where(sticks, stick, new + slip), 0.0)
-    return given + _join_momenta(row.arm, new - old), new
+        v = v + (push - pushed)[:, None] * row.normal_response[None]
+        slip = _project_across(normal, old - row.slip_mobility[:, None] * v)
+        size, most = _norm_one(slip), kinetic * push
+        slip = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0)[:, None] * slip
+        held = _dot_one(normal, stick)
+        sticks = (held >= 0) & (_norm_one(_project_across(normal, stick)) <= static * held)
+        new = jnp.where((row.share > 0)[:, None], jnp.where(sticks[:, None], stick, new + slip), 0.0)
+    change = new - old
+    turned = _multiply_one(body.inverse_inertia[None], _cross_one(arm, change))
+    return moved + jnp.concatenate([(body.inverse_mass * change[0])[None], turned], axis=1)[0], new[0]
+
+
+def _dot_one(a: Array, b: Array) -> Array:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
+def _cross_one(a: Array, b: Array) -> Array:
+    return jnp.stack([a[:, i - 2] * b[:, i - 1] - a[:, i - 1] * b[:, i - 2] for i in range(3)], axis=1)
+
+
+def _multiply_one(columns: Array, vector: Array) -> Array:
+    return columns[:, 0] * vector[:, 0:1] + columns[:, 1] * vector[:, 1:2] + columns[:, 2] * vector[:, 2:3]
+
+
+def _norm_one(vector: Array) -> Array:
+    return norm(jnp.moveaxis(vector, 1, -1))
+
+
+def _project_across(normal: Array, vector: Array) -> Array:
+    return vector - _dot_one(normal, vector)[:, None] * normal
 
 
 def _sum_impulses(rows: _PointRows, j: Array) -> Array:
     """The momentum and angular momentum `(6, lanes)` that all impulses together give to their body."""
     return jnp.sum(_join_momenta(rows.arm, j), axis=0)
+
+
+def _sum_velocities(rows: _PointRows, body: _Body, j: Array) -> Array:
+    """The velocity and ω `(6, lanes)` that all impulses together give to their body."""
+    return jnp.concatenate(_find_velocities(body, _sum_impulses(rows, j)))
 
 
 def _join_momenta(arm: Array, j: Array) -> Array:
@@ -326,12 +354,3 @@ def _cross(a: Array, b: Array) -> Array:
     """Vector products."""
     (ax, ay, az), (bx, by, bz) = ([vector[..., i : i + 1, :] for i in range(3)] for vector in (a, b))
     return jnp.concatenate([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
-
-
-def _project_across(normal: Array, vector: Array) -> Array:
-    return vector - _dot(normal, vector) * normal
-
-
-def _norm(vector: Array) -> Array:
-    """Length; its derivative at zero is zero."""
-    return square_root(_dot(vector, vector))
