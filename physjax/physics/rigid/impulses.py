@@ -51,17 +51,18 @@ class Impact(NamedTuple):
 class _PointRows(NamedTuple):
     """What the sweeps need of each point's own mobility K = W_kk; vectors are `(points, 3, lanes)`, numbers `(points, 1, lanes)`.
 
-    `share` is 1/(n·Kn) of active points, else 0. With friction also `inverse` K⁻¹, `normal_response` Kn,
-    `push_direction` K⁻¹n/(n·K⁻¹n), and `slip_mobility`, one over the largest eigenvalue of K across the normal.
+    `share` is 1/(n·Kn) of `active` points, else 0. With friction also `inverse` K⁻¹, `across`, which is K⁻¹ for impulses
+    across the normal alone, `normal_response` Kn, and `slip_mobility`, one over the largest eigenvalue of K across the normal.
     """
 
     arm: Array
     normal: Array
     before: Array
     share: Array
+    active: Array
     inverse: Array | None = None
+    across: Array | None = None
     normal_response: Array | None = None
-    push_direction: Array | None = None
     slip_mobility: Array | None = None
     friction: tuple[Array, Array] | None = None
 
@@ -109,7 +110,7 @@ def _solve_impulses(rows: _PointRows, body: "_Body", restitution: Array | None, 
     Compression is the inelastic problem. Expansion gives the same impulses again, times K_r as far as the energy allows,
     and then solves for friction with the normal impulses given.
     """
-    active = jnp.any(rows.share > 0, axis=0, keepdims=True)
+    active = jnp.any(rows.active, axis=0, keepdims=True)
 
     def scale_impulses(j: Array) -> Array:
         work, given = jnp.sum(rows.before * j, axis=(0, 1), keepdims=True), _sum_impulses(rows, j)
@@ -123,15 +124,21 @@ def _solve_impulses(rows: _PointRows, body: "_Body", restitution: Array | None, 
 
     zero = jnp.zeros_like(rows.before)
     if struck is None or rows.friction is None:
-        return scale_impulses(_solve_fixed_point(rows, body, zero, active, None))
+        return scale_impulses(_solve_fixed_point(rows, body, zero, active))
 
     # one loop over both phases: the sweeps, and all that their derivatives take, then stand in the program once
     def pass_phase(j: Array, expands: Array) -> tuple[Array, None]:
         known = struck & expands
-        solved = _solve_fixed_point(rows, body, j, active & (known[None] | ~expands), (known, _dot(rows.normal, j)))
+        solved = _solve_fixed_point(_keep_normal_impulses(rows, known), body, j, active & (known[None] | ~expands))
         return jnp.where(expands, solved, scale_impulses(solved)), None
 
     return lax.scan(pass_phase, zero, jnp.array([False, True]))[0]
+
+
+def _keep_normal_impulses(rows: _PointRows, known: Array) -> _PointRows:
+    """The points with nothing that changes the normal impulses of the lanes in which these are known."""
+    inverse = jnp.where(known[None, None], rows.across, rows.inverse)
+    return rows._replace(share=jnp.where(known[None], 0.0, rows.share), inverse=inverse)
 
 
 class _Body(NamedTuple):
@@ -162,7 +169,7 @@ def _build_rows(points: Points, active: Array, body: _Body) -> _PointRows:
     active = _flatten_numbers(active)
     if points.friction is None:
         stiffness = _dot(normal, _apply_point_mobility(body, arm, normal))
-        return _PointRows(arm, normal, before, jnp.where(active, 1 / stiffness, 0.0))
+        return _PointRows(arm, normal, before, jnp.where(active, 1 / stiffness, 0.0), active)
     arms = jnp.broadcast_to(arm[:, None], (len(arm), 3, *arm.shape[1:]))
     axes = jnp.broadcast_to(jnp.eye(3, dtype=arm.dtype)[None, :, :, None], arms.shape)
     mobility = _apply_point_mobility(body, arms, axes)
@@ -183,32 +190,31 @@ def _build_rows(points: Points, active: Array, body: _Body) -> _PointRows:
         normal,
         before,
         share=jnp.where(active, 1 / stiffness, 0.0),
+        active=active,
         inverse=inverse,
+        # K⁻¹ - K⁻¹n (K⁻¹n)ᵀ/(n·K⁻¹n): it leaves the normal impulse as it is
+        across=inverse - leaning[:, None] * (leaning / ease)[:, :, None],
         normal_response=normal_response,
-        push_direction=leaning / ease,
         slip_mobility=1 / stiffest,
         friction=(_flatten_numbers(points.friction[0]), _flatten_numbers(points.friction[1])),
     )
 
 
-def _solve_fixed_point(
-    rows: _PointRows, body: _Body, start: Array, wanted: Array, known: tuple[Array, Array] | None
-) -> Array:
+def _solve_fixed_point(rows: _PointRows, body: _Body, start: Array, wanted: Array) -> Array:
     """Impulses `(points, 3, lanes)` that a sweep over the points leaves unchanged, where `wanted` `(1, 1, lanes)`; else `start`.
 
     Their derivatives are those of a fixed point, by the implicit function theorem: a linear problem that is solved by
-    sweeps as well, so that nothing is differentiated through the sweeps themselves. Of some lanes the
-    normal impulses are `known` (which lanes, and the impulses [N s]), and only friction is solved for.
+    sweeps as well, so that nothing is differentiated through the sweeps themselves.
     """
 
     def residual(j: Array) -> Array:
-        return jnp.where(wanted, _sweep_points(rows, body, known, j, _sum_velocities(rows, body, j))[0], start) - j
+        return jnp.where(wanted, _sweep_points(rows, body, j, _sum_velocities(rows, body, j))[0], start) - j
 
     def repeat_sweeps(_, j: Array) -> Array:
         # the velocity of the body is carried along, so that a point's turn costs no sum over the other points
         def pass_(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             before, moved_before, going = carry
-            after, moved_after = _sweep_points(rows, body, known, before, moved_before)
+            after, moved_after = _sweep_points(rows, body, before, moved_before)
             # a lane that has settled waits for the others without a change: its result does not depend on theirs
             after = jnp.where(going, after, before)
             return after, jnp.where(going[0], moved_after, moved_before), _find_changed_lanes(before, after)
@@ -227,13 +233,10 @@ def _solve_fixed_point(
     return lax.custom_root(residual, start, repeat_sweeps, solve)
 
 
-def _sweep_points(
-    rows: _PointRows, body: _Body, known: tuple[Array, Array] | None, j: Array, moved: Array
-) -> tuple[Array, Array]:
+def _sweep_points(rows: _PointRows, body: _Body, j: Array, moved: Array) -> tuple[Array, Array]:
     """The impulses after one sweep over the points, and the velocity and ω `(6, lanes)` that they give to the body."""
-    known_lanes, pushes = (None, None) if known is None else known
     # one after the other: points that took their turns at once would overshoot where they share a load
-    moved, after = lax.scan(partial(_update_point, body, known_lanes), moved, (rows, j, pushes))
+    moved, after = lax.scan(partial(_update_point, body), moved, (rows, j))
     return after, moved
 
 
@@ -248,29 +251,22 @@ def _repeat_until_settled(pass_: Callable[[tuple], tuple], start: tuple) -> tupl
     return bounded_while_loop(lambda carry: any_lane(carry[-1]), pass_, start, most=MAX_SWEEPS)
 
 
-def _update_point(
-    body: _Body, known: Array | None, moved: Array, point: tuple[_PointRows, Array, Array | None]
-) -> tuple[Array, Array]:
+def _update_point(body: _Body, moved: Array, point: tuple[_PointRows, Array]) -> tuple[Array, Array]:
     """A sweep's turn of one point, the impulses at the others given: it sticks if it can, else it is pushed and slips.
 
     Sticking is the impulse that stops the point, if it is within the cone of μ_s. Slipping takes a step against the
     velocity across the normal, at most as long as the stiffest direction allows, and cuts it to the disc of μ_k.
     """
-    row, old, wanted = point
+    row, old = point
     # vectors are (1, 3, lanes) here and numbers (1, lanes): the compiler then keeps what several components share
     arm, normal, before, old = (vector[None] for vector in (row.arm, row.normal, row.before, old))
     v = before + moved[None, :3] + _cross_one(moved[None, 3:], arm)
     pushed = _dot_one(normal, old)
     push = jnp.maximum(pushed - _dot_one(normal, v) * row.share, 0.0)
-    push = push if known is None else jnp.where(known, wanted, push)
     new = push[:, None] * normal
     if row.friction is not None:
         static, kinetic = row.friction
         stick = old - _multiply_one(row.inverse[None], v)
-        if known is not None:
-            # the normal impulse is known: the sticking impulse of that size, which leaves a normal velocity
-            lacking = jnp.where(known, push - _dot_one(normal, stick), 0.0)
-            stick, static = stick + lacking[:, None] * row.push_direction[None], jnp.where(known, kinetic, static)
         # the slip after this turn's normal impulse, which moves the point across the normal as well
         v = v + (push - pushed)[:, None] * row.normal_response[None]
         slip = _project_across(normal, old - row.slip_mobility[:, None] * v)
@@ -278,7 +274,7 @@ def _update_point(
         slip = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), 1.0)[:, None] * slip
         held = _dot_one(normal, stick)
         sticks = (held >= 0) & (_norm_one(_project_across(normal, stick)) <= static * held)
-        new = jnp.where((row.share > 0)[:, None], jnp.where(sticks[:, None], stick, new + slip), 0.0)
+        new = jnp.where(row.active[:, None], jnp.where(sticks[:, None], stick, new + slip), 0.0)
     change = new - old
     turned = _multiply_one(body.inverse_inertia[None], _cross_one(arm, change))
     return moved + jnp.concatenate([(body.inverse_mass * change[0])[None], turned], axis=1)[0], new[0]
