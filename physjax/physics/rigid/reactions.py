@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool
 
-from physjax.backend import materialise_where
-from physjax.loops import Time
+from physjax.backend import materialise, materialise_where
+from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.legs import SHORTEST_FLIGHT_SHARE, Motion, Tree, choose_lanes
 from physjax.physics.rigid.impulses import Impact, Points, apply_contact_impulses
@@ -69,8 +69,16 @@ class Place(NamedTuple):
     @classmethod
     def find(cls, kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies, inertia: Inertia) -> "Place":
         """Where bodies are at a time t."""
-        mobility = Mobility.of(state, inertia)
-        return cls(t, state, mobility, gather_point_states(kinds, t, state, mobility.velocities(state)))
+
+        def measure() -> tuple[Mobility, tuple[Array, Array]]:
+            mobility = Mobility.of(state, inertia)
+            return mobility, mobility.velocities(state)
+
+        # stored, or every component of every point would compute both again, and every reader of a point all of it
+        time = to_float_time(t)
+        mobility, velocities = materialise(time, measure)
+        points = materialise(time, lambda: gather_point_states(kinds, t, state, velocities))
+        return cls(t, state, mobility, points)
 
 
 class Meeting(NamedTuple):
