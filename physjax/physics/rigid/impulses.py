@@ -129,7 +129,9 @@ def _solve_impulses(rows: _PointRows, body: "_Body", restitution: Array | None, 
     # one loop over both phases: the sweeps, and all that their derivatives take, then stand in the program once
     def pass_phase(j: Array, expands: Array) -> tuple[Array, None]:
         known = struck & expands
-        solved = _solve_fixed_point(_keep_normal_impulses(rows, known), body, j, active & (known[None] | ~expands))
+        solved = _solve_fixed_point(
+            _keep_normal_impulses(rows, known), body, j, active & (known[None] | ~expands), known
+        )
         return jnp.where(expands, solved, scale_impulses(solved)), None
 
     return lax.scan(pass_phase, zero, jnp.array([False, True]))[0]
@@ -200,15 +202,21 @@ def _build_rows(points: Points, active: Array, body: _Body) -> _PointRows:
     )
 
 
-def _solve_fixed_point(rows: _PointRows, body: _Body, start: Array, wanted: Array) -> Array:
+def _solve_fixed_point(rows: _PointRows, body: _Body, start: Array, wanted: Array, known: Array | None = None) -> Array:
     """Impulses `(points, 3, lanes)` that a sweep over the points leaves unchanged, where `wanted` `(1, 1, lanes)`; else `start`.
 
     Their derivatives are those of a fixed point, by the implicit function theorem: a linear problem that is solved by
-    sweeps as well, so that nothing is differentiated through the sweeps themselves.
+    sweeps as well, so that nothing is differentiated through the sweeps themselves. In the lanes that are `known` the
+    normal impulses are those of `start`.
     """
 
     def residual(j: Array) -> Array:
-        return jnp.where(wanted, _sweep_points(rows, body, j, _sum_velocities(rows, body, j))[0], start) - j
+        kept = j
+        if known is not None:
+            # no change in value, since sweeps keep them: the derivatives are then those of impulses that are known
+            kept = j + jnp.where(known[None], _dot(rows.normal, start - j), 0.0) * rows.normal
+        swept = _sweep_points(rows, body, kept, _sum_velocities(rows, body, kept))[0]
+        return jnp.where(wanted, swept, start) - j
 
     def repeat_sweeps(_, j: Array) -> Array:
         # the velocity of the body is carried along, so that a point's turn costs no sum over the other points
