@@ -273,6 +273,9 @@ def _update_point(body: _Body, moved: Array, point: tuple[_PointRows, Array]) ->
     push = jnp.maximum(pushed - _dot_one(normal, v) * row.share, 0.0)
     new = push[:, None] * normal
     if row.friction is not None:
+        assert row.inverse is not None
+        assert row.normal_response is not None
+        assert row.slip_mobility is not None
         static, kinetic = row.friction
         stick = old - _multiply_one(row.inverse[None], v)
         # the slip after this turn's normal impulse, which moves the point across the normal as well

@@ -102,11 +102,11 @@ class ContactKind(NamedTuple):
     """
 
     contact: PointContact
-    count: int
+    size: int
 
     def map(self, function: Callable[..., T], *each: PyTree) -> T:
         """`function(contact, *each)` of every contact, and of what has an entry for each, along a leading axis."""
-        if self.count > 1:
+        if self.size > 1:
             return jax.vmap(function)(self.contact, *each)
         one = function(self.contact, *jax.tree.map(lambda leaf: leaf[0], each))
         return jax.tree.map(lambda leaf: leaf[None], one)
@@ -114,7 +114,7 @@ class ContactKind(NamedTuple):
     def facing(self, t: Time, state: RigidBodies) -> "ContactKind":
         """The contacts with their surfaces as the bodies meet them from where they are: of a plate the nearer face."""
         face = lambda contact: contact.facing(to_float_time(t), state)  # noqa: E731
-        return ContactKind(face(self.contact) if self.count == 1 else jax.vmap(face)(self.contact), self.count)
+        return ContactKind(face(self.contact) if self.size == 1 else jax.vmap(face)(self.contact), self.size)
 
 
 def stack_body_contacts(scene: Scene) -> tuple[ContactKind, ...]:
@@ -137,7 +137,7 @@ def face_surfaces(kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies) -
 
 def count_points(kinds: tuple[ContactKind, ...]) -> int:
     """How many points all contacts together have."""
-    return sum(kind.count * kind.contact.hull.points.shape[-2] for kind in kinds)
+    return sum(kind.size * kind.contact.hull.points.shape[-2] for kind in kinds)
 
 
 def gather_point_states(
@@ -148,7 +148,7 @@ def gather_point_states(
     What only some surfaces have, curvature or friction, is zero at the others.
     """
     locate = lambda contact: contact.point_state(to_float_time(t), state, velocities)  # noqa: E731
-    parts = [locate(kind.contact) if kind.count == 1 else _join_contacts(kind.map(locate)) for kind in kinds]
+    parts = [locate(kind.contact) if kind.size == 1 else _join_contacts(kind.map(locate)) for kind in kinds]
     if len(parts) == 1:
         return parts[0]
     if any(part.turning is not None for part in parts):
@@ -197,9 +197,9 @@ def find_dips(kinds: tuple[ContactKind, ...], on: Array, start: Particles, end: 
     parts, first = [], 0
     for kind in kinds:
         points = kind.contact.hull.points.shape[-2]
-        some = slice(first, first := first + kind.count * points)
+        some = slice(first, first := first + kind.size * points)
         before, after = (
-            Particles(*(leaf[some].reshape(kind.count, points, *leaf.shape[1:]) for leaf in places))
+            Particles(*(leaf[some].reshape(kind.size, points, *leaf.shape[1:]) for leaf in places))
             for places in (start, end)
         )
         lanes = before.position.shape[1:-1]

@@ -143,7 +143,7 @@ def exchange_impulses(scene: Scene, leg: Leg, stage: Stage, here: Place, times: 
     zero = jnp.zeros_like(state.momentum)
     impact = materialise_where(active, solve, Impact(state, jnp.zeros_like(point_state.signed_distance), (zero, zero)))
     gained = impact.bodies.momentum - state.momentum, impact.bodies.angular_momentum - state.angular_momentum
-    thrust = choose_lanes(stage.begins, tuple(scale(2 / rest, part) for part in gained), leg.thrust)
+    thrust = choose_lanes(stage.begins, (scale(2 / rest, gained[0]), scale(2 / rest, gained[1])), leg.thrust)
     leg = Leg(leg.before, thrust, on, leg.rests, load_speed)
     held, center = _push_out(leg, impact, here)
     # by energy, which sees rotation as well; at both ends, so that a body that turns back is not taken for one at rest

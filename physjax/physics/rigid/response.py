@@ -133,8 +133,10 @@ def fold_body_flights(
         return add(total, _build_whole_flight(motion, scene, leg, t, dt, after)), after
     kinds = stack_body_contacts(scene)
     _, durations = find_impacts(motion, scene, kinds, t, dt, logged=True)
-    progress, total = replay_step(motion, scene, kinds, durations, t, dt, (add, total))
-    return total, _invalidate_overrun_lanes(kinds, progress, t, dt)
+    assert durations is not None
+    progress, after = replay_step(motion, scene, kinds, durations, t, dt, (add, total))
+    assert after is not None
+    return after, _invalidate_overrun_lanes(kinds, progress, t, dt)
 
 
 def _build_whole_flight(
@@ -203,7 +205,7 @@ def _resolve_at_step_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -
 
 def _move_out(kind: ContactKind, t: ArrayLike, state: RigidBodies) -> RigidBodies:
     """The bodies moved out of one surface after the other."""
-    if kind.count == 1:
+    if kind.size == 1:
         return kind.contact.respond(t, state)
     return lax.scan(lambda state, contact: (contact.respond(t, state), None), state, kind.contact)[0]
 
