@@ -193,8 +193,8 @@ def _take_turn(
     durations = search.durations
     if durations is not None:
         numbers = jnp.arange(MAX_LEGS).reshape(-1, *(1,) * dt.ndim)
-        here = (numbers == search.impacts[None]) & stage.strikes[None]
-        durations = jnp.where(here, h[None], durations)
+        slot = (numbers == search.impacts[None]) & stage.strikes[None]
+        durations = jnp.where(slot, h[None], durations)
     return _Search(
         leg=met.leg._replace(before=before),
         center=center,

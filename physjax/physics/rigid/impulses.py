@@ -139,6 +139,8 @@ def _solve_impulses(rows: _PointRows, body: "_Body", restitution: Array | None, 
 
 def _keep_normal_impulses(rows: _PointRows, known: Array) -> _PointRows:
     """The points with nothing that changes the normal impulses of the lanes in which these are known."""
+    assert rows.inverse is not None
+    assert rows.across is not None
     inverse = jnp.where(known[None, None], rows.across, rows.inverse)
     return rows._replace(share=jnp.where(known[None], 0.0, rows.share), inverse=inverse)
 
