@@ -192,7 +192,7 @@ def _take_turn(
     before = choose_lanes(stage.strikes, met.struck, choose_lanes(ends, met.held, leg.before))
     durations = search.durations
     if durations is not None:
-        numbers = jnp.arange(MAX_LEGS).reshape(-1, *(1,) * dt.ndim)
+        numbers = jnp.arange(MAX_LEGS, dtype=jnp.int32).reshape(-1, *(1,) * dt.ndim)
         slot = (numbers == search.impacts[None]) & stage.strikes[None]
         durations = jnp.where(slot, h[None], durations)
     return _Search(
