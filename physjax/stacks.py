@@ -23,16 +23,21 @@ class Stack(eqx.Module, Generic[P]):
     part: P
     places: tuple[int, ...] = eqx.field(static=True)
 
+    @property
+    def size(self) -> int:
+        """How many parts there are."""
+        return len(self.places)
+
     def map(self, function: Callable[..., PyTree], *each: PyTree) -> PyTree:
         """`function(part, *each)` of every part, along a leading axis; `each` has that axis as well."""
-        if len(self.places) > 1:
+        if self.size > 1:
             return jax.vmap(function)(self.part, *each)
         own = jax.tree.map(lambda leaf: leaf[0], each)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], function(self.part, *own))
 
     def replace(self, function: Callable[[P], P]) -> "Stack[P]":
         """The stack with `function(part)` in place of every part."""
-        return Stack((jax.vmap(function) if len(self.places) > 1 else function)(self.part), self.places)
+        return Stack((jax.vmap(function) if self.size > 1 else function)(self.part), self.places)
 
 
 def stack_alike(parts: Sequence[P]) -> tuple[Stack[P], ...]:

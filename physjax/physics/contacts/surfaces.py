@@ -38,7 +38,7 @@ class Surfaces(eqx.Module):
         return cls(stack_alike(surfaces))
 
     def __len__(self) -> int:
-        return sum(len(stack.places) for stack in self.stacks)
+        return sum(stack.size for stack in self.stacks)
 
     @property
     def curved(self) -> bool:
@@ -100,7 +100,7 @@ class Surfaces(eqx.Module):
         """Whether a lane may meet any of them within a step, or stop where it slides: cheap, true of every lane that does."""
         meets, first = jnp.zeros(start.lanes, bool), 0
         for stack in self.stacks:
-            touching = jnp.isfinite(since[first : (first := first + len(stack.places))])
+            touching = jnp.isfinite(since[first : (first := first + stack.size)])
             ask = lambda part, touching: part.may_meet(touching, t, dt, start, end)  # noqa: E731
             meets = meets | jnp.any(stack.map(ask, touching), axis=0)
         return meets
@@ -133,7 +133,7 @@ class Surfaces(eqx.Module):
         return map_stacks(own, self.stacks)
 
     def _mark(self, says: Callable[[Any], bool]) -> np.ndarray:
-        return np.concatenate([np.full(len(stack.places), says(stack.part)) for stack in self.stacks])
+        return np.concatenate([np.full(stack.size, says(stack.part)) for stack in self.stacks])
 
 
 def mask_surfaces(marks: np.ndarray, like: Array) -> Array:

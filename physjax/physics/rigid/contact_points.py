@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from itertools import product
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import Numbers, as_real_quantity, unchecked_quantity
-from physjax.physics.rigid.spatial import RigidBodies, to_world_frame
+from physjax.physics.rigid.spatial import RigidBodies, to_world_frame_each
 from physjax.vectors import scale
 
 _CORNERS = tuple(product((-1.0, 1.0), repeat=3))
@@ -66,4 +65,4 @@ class ContactPoints(eqx.Module):
 
     def arms(self, bodies: RigidBodies) -> Float[Array, "points *lanes 3"]:
         """From each body's center of mass to its points [m], in the world frame, the points first."""
-        return jax.vmap(lambda point: to_world_frame(bodies, point))(jnp.moveaxis(self.points, -2, 0))
+        return to_world_frame_each(bodies, jnp.moveaxis(self.points, -2, 0))

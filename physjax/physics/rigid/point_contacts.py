@@ -5,11 +5,10 @@ moves a body in it, and slower than a share of the speed that it gives, would no
 """
 
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
@@ -20,9 +19,9 @@ from physjax.physics.contacts.events import Dip, find_dip
 from physjax.physics.contacts.face import LowestPoint
 from physjax.physics.rigid.contact_points import ContactPoints
 from physjax.physics.rigid.impulses import Points
-from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
+from physjax.stacks import Stack, stack_alike
 from physjax.vectors import dot, norm
 
 RESTING_SPEED_SHARE = 0.1
@@ -33,6 +32,8 @@ DISTANCE_ROUNDING = 64
 """Units of rounding of its place, and of its way in a step, below which a point touches."""
 SPEED_ROUNDING = 16
 """Units of rounding of its speed below which a point stays."""
+
+T = TypeVar("T")
 
 
 class ContactPointState(NamedTuple):
@@ -59,9 +60,14 @@ class PointContact(Contact):
     def narrow(self) -> bool:
         """Whether a fast point may pass through the surface and out again within a step."""
 
+    @property
     @abstractmethod
-    def point_state(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> ContactPointState:
-        """The points of the hull at the surface."""
+    def moves(self) -> bool:
+        """Whether the surface may be elsewhere at another time."""
+
+    @abstractmethod
+    def point_state(self, t: ArrayLike, bodies: RigidBodies, velocities: tuple[Array, Array]) -> ContactPointState:
+        """The points of the hull at the surface, of bodies with these velocities v and ω."""
 
     @abstractmethod
     def walls(self) -> tuple["PointContact", ...]:
@@ -88,42 +94,54 @@ class PointContact(Contact):
         """Where in a leg a point comes lowest, as a share of it, and its distance there [m]."""
 
 
-def list_body_contacts(scene: Scene) -> list[PointContact]:
-    """The contacts of bodies with surfaces; not those of bodies with each other."""
-    return [contact for contact in scene.contacts if isinstance(contact, PointContact)]
+ContactKind = Stack[PointContact]
+"""Contacts that differ in numbers only."""
 
 
-def use_facing_surfaces(scene: Scene, t: Time) -> Scene:
-    """The scene with its surfaces as its bodies meet them from where they are: of a room its walls, of a slab the nearer face."""
-    facing = []
-    for contact in scene.contacts:
-        if isinstance(contact, PointContact):
-            facing += [wall.facing(to_float_time(t), scene.state) for wall in contact.walls()]
-        else:
-            facing.append(contact)
-    return scene.replace(contacts=tuple(facing))
+def stack_body_contacts(scene: Scene) -> tuple[ContactKind, ...]:
+    """The contacts of bodies with surfaces by kind, of a room those with its walls; not those of bodies with each other.
+
+    All points on all surfaces of a kind are evaluated at once: sixty walls cost what one costs to compile.
+    """
+    contacts = [wall for contact in scene.contacts if isinstance(contact, PointContact) for wall in contact.walls()]
+    return stack_alike([jax.tree.map(jnp.asarray, contact) for contact in contacts])
 
 
-def find_load_speed(scene: Scene, t: Time, dt: Array) -> Array:
-    """The speed that the loads give in a step [m/s], which is the measure of small speeds and distances."""
-    force, _ = scene.state.generalised_force(scene, t)
-    return lax.stop_gradient(dt * norm(force) / scene.mass.mass)
+def face_surfaces(kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies) -> tuple[ContactKind, ...]:
+    """The contacts as each body meets them from where it is."""
+    time = to_float_time(t)
+    return tuple(kind.replace(lambda contact: contact.facing(time, state)) for kind in kinds)
 
 
-def gather_point_states(scene: Scene, t: Time, state: RigidBodies) -> ContactPointState:
+def count_points(kinds: tuple[ContactKind, ...]) -> int:
+    """How many points all contacts together have."""
+    return sum(kind.size * kind.part.hull.points.shape[-2] for kind in kinds)
+
+
+def gather_point_states(
+    kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies, velocities: tuple[Array, Array]
+) -> ContactPointState:
     """Every point of every hull at its surface, joined along the axis of points.
 
     What only some surfaces have, curvature or friction, is zero at the others.
     """
-    parts = [contact.point_state(to_float_time(t), state, scene.mass) for contact in list_body_contacts(scene)]
-    if len(parts) > 1 and any(part.turning is not None for part in parts):
+    locate = lambda contact: contact.point_state(to_float_time(t), state, velocities)  # noqa: E731
+    parts = [locate(kind.part) if kind.size == 1 else _join_contacts(kind.map(locate)) for kind in kinds]
+    if len(parts) == 1:
+        return parts[0]
+    if any(part.turning is not None for part in parts):
         flat = lambda part: (jnp.zeros_like(part.points.normal), jnp.zeros_like(part.signed_distance))  # noqa: E731
         parts = [part._replace(turning=part.turning or flat(part)) for part in parts]
-    if len(parts) > 1 and any(part.points.friction is not None for part in parts):
+    if any(part.points.friction is not None for part in parts):
         zero = lambda part: (jnp.zeros_like(part.signed_distance), jnp.zeros_like(part.signed_distance))  # noqa: E731
         rough = [part.points._replace(friction=part.points.friction or zero(part)) for part in parts]
         parts = [part._replace(points=points) for part, points in zip(parts, rough, strict=True)]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def _join_contacts(tree: T) -> T:
+    """Arrays `(contacts, points, ...)` with all points along one axis."""
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), tree)
 
 
 def find_touching_points(
@@ -149,23 +167,22 @@ def find_resting_points(
     )
 
 
-def find_resting_points_now(scene: Scene, t: Time, dt: Array) -> Array:
-    """Which points touch and stay at the scene's own state."""
-    point_state = lax.stop_gradient(gather_point_states(scene, t, scene.state))
-    return find_resting_points(point_state, scene.state, find_load_speed(scene, t, dt), dt)
-
-
-def find_dips(scene: Scene, on: Array, start: ContactPointState, end: ContactPointState, t: Time, dt: Array) -> Dip:
+def find_dips(kinds: tuple[ContactKind, ...], on: Array, start: Particles, end: Particles, t: Time, dt: Array) -> Dip:
     """Which points meet their surface within a leg, bracketed by the cubics of their signed distances.
 
-    Points that rest (`on`) are carried and meet nothing.
+    The points are where the centers of their radii are. Those that rest (`on`) are carried and meet nothing.
     """
     parts, first = [], 0
-    for contact in list_body_contacts(scene):
-        some = slice(first, first := first + contact.hull.points.shape[-2])
-        lanes = start.signed_distance[some].shape
+    for kind in kinds:
+        points = kind.part.hull.points.shape[-2]
+        some = slice(first, first := first + kind.size * points)
+        before, after = (
+            Particles(*(leaf[some].reshape(kind.size, points, *leaf.shape[1:]) for leaf in places))
+            for places in (start, end)
+        )
+        lanes = before.position.shape[1:-1]
         times, steps = (jnp.broadcast_to(number, lanes) for number in (to_float_time(t), dt))
-        before, after = (Particles(*(leaf[some] for leaf in point_state.center)) for point_state in (start, end))
-        parts.append(find_dip(contact, times, steps, before, after))
-    dip = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+        find = lambda contact, before, after, times=times, steps=steps: find_dip(contact, times, steps, before, after)  # noqa: E731
+        parts.append(_join_contacts(kind.map(find, before, after)))
+    dip = parts[0] if len(parts) == 1 else jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return dip._replace(last=jnp.where(on, jnp.inf, dip.last))

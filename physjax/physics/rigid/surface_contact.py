@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import demand_start_outside
+from physjax.loops import is_library_part
 from physjax.particles import Particles
 from physjax.physics.contacts.face import LowestPoint
 from physjax.physics.contacts.path_search import find_path_dip
@@ -24,7 +25,7 @@ from physjax.physics.rigid.impulses import Points
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.point_contacts import ContactPointState, PointContact
 from physjax.physics.rigid.response import collide
-from physjax.physics.rigid.spatial import RigidBodies, angular_velocity
+from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 from physjax.vectors import cross, scale
 
@@ -70,14 +71,13 @@ class SurfaceContact(PointContact):
                 "nothing: the others are for particles."
             )
 
-    def point_state(self, t: ArrayLike, bodies: RigidBodies, inertia: Inertia) -> ContactPointState:
+    def point_state(self, t: ArrayLike, bodies: RigidBodies, velocities: tuple[Array, Array]) -> ContactPointState:
         """The points of the hull at the surface; what touches is a radius below each of them."""
         arm = self.hull.arms(bodies)
         time = jnp.broadcast_to(t, arm.shape[:-1])
         where = bodies.position[None] + arm
         normal = self.surface.normal_at(time, where)
-        omega = jnp.broadcast_to(angular_velocity(bodies, inertia), arm.shape)
-        straight = scale(1 / inertia.mass, bodies.momentum)[None]
+        straight, omega = (jnp.broadcast_to(vector, arm.shape) for vector in velocities)
         center = Particles(where, straight + cross(omega, arm))
         # the point of the hull that is nearest to the surface: a radius below the center, along the normal
         low = arm - scale(self._radius(arm), normal)
@@ -114,6 +114,11 @@ class SurfaceContact(PointContact):
     def relative(self, velocity: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
         """Velocities relative to the surface [m/s]."""
         return self.surface.relative(velocity)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the surface may be elsewhere at another time: the library's own move with their velocity, if at all."""
+        return self.surface.velocity is not None or not is_library_part(type(self.surface))
 
     @property
     def narrow(self) -> bool:
