@@ -171,7 +171,8 @@ def _advance(
     shortest = shortest_duration(dt)
     duration = jnp.where(refining, jnp.maximum(now.bracket.next, shortest), rest)
     end = materialise_where(tries | refining, lambda: motion(held, leg_start, duration).state, now.state)
-    bracket = _begin_bracket(held, faces, mode, tries, end, start_time, rest, now.bracket)
+    begin = lambda: _begin_bracket(held, faces, mode, tries, end, start_time, rest, now.bracket)  # noqa: E731
+    bracket = materialise_where(tries, begin, now.bracket)
     arrives = tries & ~bracket.refining
     at_end = now._replace(
         elapsed=jnp.where(arrives, dt, now.elapsed),
@@ -222,9 +223,7 @@ def _begin_bracket(
 ) -> Bracket:
     """The brackets of the lanes that tried the rest of their step and have an event on the way."""
     start = held.state
-    event = materialise_where(
-        tries, lambda: find_next_event(faces, get_reaction(held), mode.pressed, start, end, t, rest)
-    )
+    event = find_next_event(faces, get_reaction(held), mode.pressed, start, end, t, rest)
     hit = tries & event.hit
     if held.held is not None:
         hit = hit & ~held.held
@@ -282,13 +281,16 @@ def _refine(
         state = respond_to_event(meeting, verdict, end)
         rest_time = to_float_time(impact_time) + measure_last_flights(meeting, verdict.rests, load)
         load_speed = norm(load) * dt
-        return state, update_contact_starts(now.since, meeting, verdict, rest_time, state, load_speed), verdict
+        since = update_contact_starts(now.since, meeting, verdict, rest_time, state, load_speed)
+        return choose_lanes(found, state, now.state), jnp.where(found[None], since, now.since), verdict
 
-    state, since, verdict = materialise_where(found, resolve)
+    nothing = jnp.zeros(found.shape, bool)
+    quiet = now.state, now.since, Verdict(guard, nothing, nothing, nothing)
+    state, since, verdict = materialise_where(found, resolve, quiet)
     after = now._replace(
         elapsed=jnp.where(found, now.elapsed + duration, now.elapsed),
-        state=choose_lanes(found, state, now.state),
-        since=jnp.where(found[None], since, now.since),
+        state=state,
+        since=since,
         bracket=_choose_bracket(refining, closer._replace(refining=closer.refining & ~found), bracket),
         legs=now.legs + found.astype(now.legs.dtype),
     )

@@ -8,7 +8,7 @@ the derivatives by ε²: the second pass corrects the first.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -65,19 +65,22 @@ def replay_step(
     add, total = (None, None) if observe is None else observe
 
     # reverse mode computes each half of a leg again: storing what it needs of one costs more than the work
-    @partial(jax.checkpoint, static_argnums=())
+    @jax.checkpoint
     def act(replay: _Replay, total: Total, duration: Array, ends: Array) -> tuple[_Replay, Total]:
         return _take_half_leg(motion, scene, kinds, replay, (duration, ends), t, dt, add, total)
 
-    def go_on(carry: tuple[_Replay, Total], half: tuple[Array, Array]) -> tuple[tuple[_Replay, Total], None]:
+    def go_on(carry: tuple[_Replay, Any], half: tuple[Array, Array]) -> tuple[tuple[_Replay, Any], None]:
         return lax.cond(
             any_lane(~carry[0].arrived), act, lambda replay, total, *_: (replay, total), *carry, *half
         ), None
 
     # a leg has two halves, in which impulses act: as it begins, and as it ends
     halves = jnp.repeat(durations, 2, axis=0), jnp.arange(2 * MAX_LEGS) % 2 == 1
-    start = _Replay(start_leg(scene.state, count_points(kinds)), progress.elapsed, progress.arrived)
-    (end, total), _ = lax.scan(go_on, (start, total), halves)
+    start: tuple[_Replay, Any] = (
+        _Replay(start_leg(scene.state, count_points(kinds)), progress.elapsed, progress.arrived),
+        total,
+    )
+    (end, total), _ = lax.scan(go_on, start, halves)
     return Progress(end.elapsed, end.leg.before, end.arrived), total
 
 
