@@ -26,7 +26,7 @@ from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
 from physjax.parts import as_module, find_plain_functions, holds_user_code
-from physjax.scene import Scene
+from physjax.scene import Scene, project
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, select_stateful_parts
 
@@ -150,8 +150,9 @@ def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
 
 
 def _is_compile_bound(scene: Scene) -> bool:
-    """Whether compiling costs more than running: few lanes, and contacts with memory, which are many small kernels."""
-    return math.prod(scene.state.lanes) < MIN_LANES_TO_SELECT and any(contact.memory for contact in scene.contacts)
+    """Whether compiling costs more than running: few lanes, and contacts within the step, which are many small kernels."""
+    timed = any((contact.response or project) is not project for contact in scene.contacts)
+    return timed and math.prod(scene.state.lanes) < MIN_LANES_TO_SELECT
 
 
 def _is_untransformed(run: tuple) -> bool:

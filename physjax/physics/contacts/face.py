@@ -14,16 +14,6 @@ from physjax.particles import Particles
 from physjax.physics.contacts.restitution import Material
 
 
-@runtime_checkable
-class Located(Protocol):
-    """A record of moving things, particles or rigid bodies, as far as contacts with surfaces that move over them go."""
-
-    @property
-    def position(self) -> Array:
-        """Where each lane is [m]."""
-        ...
-
-
 LowestPoint = tuple[Array, Array]
 """Where a path comes lowest, as a share of the step, and the signed distance [m] there."""
 

@@ -4,7 +4,7 @@ A step is flown leg by leg, from one impact to the next. Every lane has its own 
 as any of them has some of the step left.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import jax
@@ -14,7 +14,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool
 
 from physjax.loops import Time
-from physjax.physics.contacts.face import Face, Located
 from physjax.scene import Scene
 from physjax.vectors import dot
 
@@ -57,15 +56,6 @@ def choose_lanes(flag: Array, a: Tree, b: Tree) -> Tree:
     """Lane by lane a where flagged, else b, for trees of numbers and vectors per lane."""
     pick = lambda x, y: jnp.where(flag if x.ndim == flag.ndim else flag[..., None], x, y)  # noqa: E731
     return jax.tree.map(pick, a, b)
-
-
-def is_overrun(surfaces: Sequence[Face], start: ArrayLike, end: ArrayLike, state: Located) -> Bool[Array, "*lanes"]:
-    """Whether a surface moves over a lane that stays where it is from one time [s] to another."""
-    over = jnp.zeros(state.position.shape[:-1], bool)
-    for surface in surfaces:
-        before, after = (surface.clearance(t, state) for t in (start, end))
-        over = over | has_moved_over(before, after, state.position)
-    return over
 
 
 def has_moved_over(before: Array, after: Array, position: Array) -> Bool[Array, "..."]:
