@@ -11,7 +11,6 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -123,8 +122,6 @@ def scale(number: ArrayLike | Float[Array, "..."], array: Float[Array, "..."]) -
     number = jnp.asarray(number)
     if number.ndim == 0:
         return number * array
-    if number.shape == array.shape[: number.ndim]:
-        return lax.broadcast_in_dim(number, array.shape, range(number.ndim)) * array
     return number.reshape(number.shape + (1,) * (array.ndim - number.ndim)) * array
 
 

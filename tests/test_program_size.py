@@ -70,29 +70,29 @@ def measure(name, differentiated):
 
 
 FORWARD = {
-    "plane": 1544,
-    "room of 6": 2314,
-    "room of 60": 2706,
-    "planes and spheres": 3384,
+    "plane": 1549,
+    "room of 6": 2319,
+    "room of 60": 2711,
+    "planes and spheres": 3409,
     "fall_with_drag": 144,
-    "flag": 2259,
-    "bouncing_ball": 1323,
-    "tumbling_box": 2873,
-    "ragdoll": 4353,
-    "car": 6788,
+    "flag": 2287,
+    "bouncing_ball": 1295,
+    "tumbling_box": 2903,
+    "ragdoll": 4398,
+    "car": 6911,
 }
 """Operations of eight rk4 steps."""
 GRADIENT = {
-    "plane": 4841,
-    "room of 6": 9406,
-    "room of 60": 9801,
-    "planes and spheres": 14485,
+    "plane": 4992,
+    "room of 6": 9557,
+    "room of 60": 9952,
+    "planes and spheres": 14745,
     "fall_with_drag": 403,
-    "flag": 8419,
-    "bouncing_ball": 4105,
-    "tumbling_box": 17956,
-    "ragdoll": 39379,
-    "car": 36858,
+    "flag": 8519,
+    "bouncing_ball": 4043,
+    "tumbling_box": 18089,
+    "ragdoll": 39158,
+    "car": 37311,
 }
 """Operations of a value and its gradient by velocities."""
 

@@ -111,7 +111,7 @@ class Kerb(contacts.Surface):
 
     def _measure_distances(self, position: Array) -> tuple[tuple[Array, Array], Array, Array]:
         """In front of the face and above the top; to the kerb; above the ground [m], each with an axis of length 1."""
-        x, height, _ = split_components(position)
+        x, height, _ = split_components(jnp.asarray(position))
         before, above = self.at - x, height - self.height
         edge = square_root(before * before + above * above)
         kerb = jnp.where((before > 0) & (above > 0), edge, jnp.maximum(before, above))

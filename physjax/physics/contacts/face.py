@@ -13,7 +13,6 @@ from physjax.checks import OptionalNumbers
 from physjax.particles import Particles
 from physjax.physics.contacts.restitution import Material
 
-
 LowestPoint = tuple[Array, Array]
 """Where a path comes lowest, as a share of the step, and the signed distance [m] there."""
 
