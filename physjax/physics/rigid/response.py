@@ -8,7 +8,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -16,10 +15,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from physjax.backend import any_lane, materialise_where
-from physjax.loops import Time, is_library_part, to_float_time
+from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
-from physjax.parts import Function
-from physjax.physics.contacts.legs import OVERRUN_ROUNDING, Flight, Motion, choose_lanes, invalidate_lanes
+from physjax.parts import holds_user_code
+from physjax.physics.contacts.legs import Flight, Motion, choose_lanes, has_moved_over, invalidate_lanes
 from physjax.physics.rigid.impact_search import Progress, find_impacts
 from physjax.physics.rigid.point_contacts import (
     ContactKind,
@@ -40,6 +39,7 @@ from physjax.physics.rigid.reactions import (
 )
 from physjax.physics.rigid.replay import replay_step
 from physjax.physics.rigid.spatial import RigidBodies
+from physjax.replays import differentiate_by_replay, hoist_closures
 from physjax.scene import Scene, trace_once
 from physjax.vectors import norm
 
@@ -65,59 +65,37 @@ def collide(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """
     if scene.couples:
         return scene.replace(state=_resolve_at_step_end(motion, scene, t, dt)[0])
-    (search, given), (replay, given_again) = _lift_closures(motion, scene, t, dt)
-
-    @jax.custom_jvp
-    def step(given: list, given_again: list, *inputs: PyTree) -> RigidBodies:
-        return search(*inputs, *given)[0]
-
-    @step.defjvp
-    def _step_jvp(primals: tuple, tangents: tuple) -> tuple:
-        given, _, *inputs = lax.stop_gradient(primals)
-        _, durations = search(*inputs, *given, logged=True)
-        return jax.jvp(lambda _, given_again, *inputs: replay(durations, *inputs, *given_again), primals, tangents)
-
-    return scene.replace(state=step(given, given_again, motion, scene, t, dt))
-
-
-def _lift_closures(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[tuple[Callable, list], ...]:
-    """The search and the replay of a step, each with the arrays that its parts close over, as arguments after its own.
-
-    A user's function may close over a number that is being differentiated, of which a custom rule knows nothing.
-    """
     inputs = (motion, scene, t, dt)
-    if not _may_close_over_numbers(motion, scene):
-        return (_search_step, []), (_replay_step, [])
-    search, given = jax.closure_convert(partial(_search_step, logged=True), *inputs)
-    durations = jax.eval_shape(partial(_search_step, logged=True), *inputs)[1]
-    replay, given_again = jax.closure_convert(_replay_step, jnp.zeros(durations.shape, durations.dtype), *inputs)
-    return (lambda *inputs, logged=False: search(*inputs), given), (replay, given_again)
+    if holds_user_code((motion, scene)):
+        return scene.replace(state=hoist_closures(_call_functions, _find_end, _log_end, _replay_end, *inputs))
+    return scene.replace(state=differentiate_by_replay(_find_end, _log_end, _replay_end, *inputs))
 
 
-def _may_close_over_numbers(*parts: PyTree) -> bool:
-    """Whether parts of a scene or a method are not the library's own, and may close over arrays that are no fields of theirs."""
-
-    def is_foreign(node: PyTree) -> bool:
-        if isinstance(node, Function):
-            return not is_library_part(node) or getattr(node.function, "__closure__", None) is not None
-        return isinstance(node, eqx.Module) and not is_library_part(type(node))
-
-    return any(map(is_foreign, jax.tree.leaves(parts, is_leaf=is_foreign)))
+def _call_functions(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> PyTree:
+    """What calls every function of a user: the motion, and the distances to the surfaces."""
+    time, state = to_float_time(t), scene.state
+    return motion(scene, t, dt).state, [
+        kind.map(lambda contact: contact.clearance(time, state)) for kind in stack_body_contacts(scene)
+    ]
 
 
-def _search_step(
-    motion: Motion, scene: Scene, t: Time, dt: ArrayLike, *, logged: bool = False
-) -> tuple[RigidBodies, Array | None]:
-    """The bodies after a step, and the durations of its legs."""
+def _find_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> RigidBodies:
+    """The bodies after a step, found without derivatives."""
     kinds = stack_body_contacts(scene)
-    progress, durations = find_impacts(motion, scene, kinds, t, dt, logged=logged)
+    return _invalidate_overrun_lanes(kinds, find_impacts(motion, scene, kinds, t, dt)[0], t, dt)
+
+
+def _log_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[RigidBodies, Array | None]:
+    """The same, and the durations of the legs for the replay."""
+    kinds = stack_body_contacts(scene)
+    progress, durations = find_impacts(motion, scene, kinds, t, dt, logged=True)
     return _invalidate_overrun_lanes(kinds, progress, t, dt), durations
 
 
-def _replay_step(durations: Array, motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> RigidBodies:
-    """The bodies after a step whose durations are known; differentiable."""
+def _replay_end(durations: Array, motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> RigidBodies:
+    """The same by a replay with these durations, differentiable."""
     kinds = stack_body_contacts(scene)
-    return _invalidate_overrun_lanes(kinds, replay_step(motion, scene, kinds, durations, t, dt)[0], t, dt)
+    return replay_step(motion, scene, kinds, durations, t, dt)[0].state
 
 
 def fold_body_flights(
@@ -160,13 +138,12 @@ def _invalidate_overrun_lanes(
         return progress.state
 
     def find_overrun() -> Array:
-        state = lax.stop_gradient(progress.state)
+        state = progress.state
         leg_start, end = to_float_time(t + progress.elapsed), to_float_time(t + dt)
-        rounding = OVERRUN_ROUNDING * float(jnp.finfo(state.dtype).eps) * norm(state.position)
-        over = jnp.zeros(rounding.shape, bool)
+        over = jnp.zeros(progress.arrived.shape, bool)
         for kind in face_surfaces(moving, leg_start, state):
             before, after = (kind.map(lambda contact, t=t: contact.clearance(t, state)) for t in (leg_start, end))
-            over = over | jnp.any((after < -rounding[None]) & (after < before - rounding[None]), axis=0)
+            over = over | jnp.any(has_moved_over(before, after, state.position[None]), axis=0)
         return over & ~progress.arrived
 
     return invalidate_lanes(materialise_where(~progress.arrived, find_overrun), progress.state)
