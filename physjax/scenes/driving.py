@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -52,26 +53,30 @@ class Suspension(rigid.Load):
 
     def wrench(self, t: ArrayLike, bodies: rigid.RigidBodies, inertia: Inertia) -> rigid.Wrench:
         """The sum of the tyres' forces and torques, each at its point of contact."""
-        # the wheels along an axis in front: one evaluation for all
         turned = to_world_frame_each(bodies, np.concatenate([[AHEAD, UP], WHEEL_MOUNTS]))
-        ahead, up, mounts = turned[0], turned[1], turned[2:]
-        steep = up[..., 1]
-        reach = (bodies.position[..., 1] + mounts[..., 1]) / jnp.maximum(steep, MIN_UP_COSINE)
-        low = mounts - scale(reach, jnp.broadcast_to(up, mounts.shape))
-        pressed = jnp.where(steep > MIN_UP_COSINE, jnp.maximum(self.length - reach, 0.0), 0.0)
-        omega = jnp.broadcast_to(rigid.angular_velocity(bodies, inertia), low.shape)
-        force = self._tyre_force(t, pressed, scale(1 / inertia.mass, bodies.momentum) + cross(omega, low), ahead)
-        return rigid.Wrench(jnp.sum(force, axis=0), jnp.sum(cross(low, force), axis=0))
+        ahead, up = turned[0], turned[1]
+        velocity, omega = scale(1 / inertia.mass, bodies.momentum), rigid.angular_velocity(bodies, inertia)
+
+        def press(mount: Array) -> tuple[Array, Array]:
+            reach = (bodies.position[..., 1] + mount[..., 1]) / jnp.maximum(up[..., 1], MIN_UP_COSINE)
+            low = mount - scale(reach, up)
+            pressed = jnp.where(up[..., 1] > MIN_UP_COSINE, jnp.maximum(self.length - reach, 0.0), 0.0)
+            force = self._tyre_force(t, pressed, velocity + cross(omega, low), ahead)
+            return force, cross(low, force)
+
+        # the wheels along an axis in front: one evaluation for all
+        force, torque = jax.vmap(press)(turned[2:])
+        return rigid.Wrench(jnp.sum(force, axis=0), jnp.sum(torque, axis=0))
 
     def _tyre_force(self, t: ArrayLike, pressed: Array, speed: Array, ahead: Array) -> Array:
-        """Normal and horizontal force of tyres [N], for a compression [m] and a velocity of the contact point [m/s]."""
+        """Normal and horizontal force of a tyre [N], for a compression [m] and a velocity of its contact point [m/s]."""
         push = jnp.where(pressed > 0, self.stiffness * pressed - self.damping * speed[..., 1], 0.0)
         push = jnp.maximum(push, 0.0)
         x, _, z = split_components(ahead)
         none = jnp.zeros_like(x)
         ahead = unit(join_components([x, none, z]))
         x, _, z = split_components(ahead)
-        ahead, aside = (jnp.broadcast_to(way, speed.shape) for way in (ahead, join_components([-z, none, x])))
+        aside = join_components([-z, none, x])
         stops = -self.brake * jnp.tanh(dot(speed, ahead) / BRAKE_FADE_SPEED)
         drive = jnp.where(t < self.brakes_at, self.throttle, stops) / len(WHEEL_MOUNTS)
         pull = scale(drive, ahead) - scale(self.grip * dot(speed, aside), aside)
