@@ -39,8 +39,7 @@ Total = TypeVar("Total")
 def log_events(
     motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, active: Array
 ) -> tuple[Progress, Leg]:
-    """The step from event to event, and how each of its legs was flown, along a leading axis of legs; no derivatives."""
-    motion, scene, surfaces, t, dt = lax.stop_gradient((motion, scene, surfaces, t, dt))
+    """The step from event to event, and how each of its legs was flown, along a leading axis of legs."""
     none = jnp.zeros(dt.shape, bool)
     verdict = Verdict(jnp.zeros(dt.shape, jnp.int32), none, none, none)
     blank = Leg(jnp.zeros_like(dt), make_free_mode(scene, surfaces), verdict, none, jnp.zeros_like(dt))

@@ -141,7 +141,7 @@ def test_a_ball_that_slides_until_it_rolls_loses_two_sevenths():
     scene = Scene(start, ball, (forces.Gravity(),), (rigid.SurfaceContact(rigid.ContactPoints.sphere(0.1), lane),))
     ledger = energy.ledger(simulate(scene, methods.rk4, dt=0.01, steps=80, save_every=20))
     closes(ledger)
-    np.testing.assert_allclose(ledger.energy.totals["Touch"], 2 / 7 * 0.5 * 6.0 * 4.0**2, rtol=1e-9)
+    np.testing.assert_allclose(ledger.energy.totals["SurfaceContact"], 2 / 7 * 0.5 * 6.0 * 4.0**2, rtol=1e-9)
     np.testing.assert_allclose(ledger.energy.totals["numerical"], 0.0, atol=1e-9)
 
 
@@ -157,7 +157,7 @@ def test_jointed_bodies_and_balls_that_hit_each_other_close_too():
     for scene, dt in ((Scene(chain, rods, (forces.Gravity(), joint), (touch,)), 1e-3), (hit, 0.01)):
         ledger = energy.ledger(simulate(scene, methods.rk4, dt=dt, steps=100, save_every=50))
         closes(ledger)
-        assert ledger.energy.totals["Touch" if scene.forces else "Balls"] > 0.01
+        assert ledger.energy.totals["SurfaceContact" if scene.forces else "Balls"] > 0.01
     np.testing.assert_allclose(ledger.energy.totals["Balls"], 0.5 * 0.5 * 2.0**2 * (1 - 0.5**2), rtol=1e-9)
 
 
