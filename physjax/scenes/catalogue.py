@@ -76,7 +76,7 @@ def _read_entries() -> dict[str, Entry]:
 
 
 def write_table(path: Path = Path(__file__).parent / "data" / TABLE) -> None:
-    """Write the table anew from the scenes themselves, after one was added or changed; half a minute."""
+    """Write the table again from the scenes themselves, after one was added or changed; half a minute."""
     from physjax.files import write_atomically
 
     with write_atomically(path) as file:

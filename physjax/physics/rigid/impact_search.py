@@ -35,6 +35,7 @@ from physjax.physics.rigid.reactions import (
     start_leg,
 )
 from physjax.physics.rigid.spatial import RigidBodies
+from physjax.roots import Bracket
 from physjax.scene import Scene
 
 MAX_LEGS = MAX_IMPACTS + 1
@@ -51,45 +52,6 @@ class Progress(NamedTuple):
     elapsed: Array
     state: RigidBodies
     arrived: Bool[Array, "*lanes"]
-
-
-class Bracket(NamedTuple):
-    """Between which durations [s] the lowest point passes its surface, its distances there [m], and where to look next.
-
-    `a` is the last duration that was looked at; the next is a share of the way from there to `b`.
-    """
-
-    a: Array
-    b: Array
-    above_a: Array
-    above_b: Array
-    share: Array
-
-    @property
-    def proposal(self) -> Array:
-        """The duration to look at next [s]."""
-        return self.a + self.share * (self.b - self.a)
-
-    def narrow(self, distance: Array, tolerance: Array) -> tuple["Bracket", Bool[Array, "*lanes"]]:
-        """The bracket after a look at the proposal, and whether that was the root.
-
-        Chandrupatla's method: inverse quadratic interpolation where it is safe, else bisection (T. R. Chandrupatla,
-        Advances in Engineering Software 28, 1997).
-        """
-        a, b, fa, fb, _ = self
-        x, fx = self.proposal, distance
-        same = (fx < 0) == (fa < 0)
-        c, fc = jnp.where(same, a, b), jnp.where(same, fa, fb)
-        b, fb = jnp.where(same, b, a), jnp.where(same, fb, fa)
-        width = jnp.abs(b - x)
-        limit = jnp.where(width > 0, tolerance / jnp.where(width > 0, width, 1.0), 1.0)
-        # his test: interpolate only where the inverse parabola through the three points is monotonic
-        xi, phi = (x - b) / (c - b), (fx - fb) / (fc - fb)
-        smooth = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
-        inverse = fx / (fb - fx) * fc / (fb - fc) + (c - x) / (b - x) * fx / (fc - fx) * fb / (fc - fb)
-        # at least a tolerance away from both ends, so that the bracket shrinks from both
-        share = jnp.clip(jnp.where(smooth, inverse, 0.5), limit, 1 - limit)
-        return Bracket(x, b, fx, fb, share), ~((limit <= 0.5) & (fx != 0))
 
 
 class _Search(NamedTuple):

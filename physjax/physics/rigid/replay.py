@@ -2,7 +2,7 @@
 
 The search finds without derivatives when bodies strike. With these times the step is a short scan over its legs. The moment
 of an impact is h - d(h)/s, with d the distance of the lowest point on the method's own step, and s its derivative by h, which
-is held: the value is only rounded anew, but it moves with all that d depends on. By differences s is off by a share ε, and
+is held: the value is only rounded again, but it moves with all that d depends on. By differences s is off by a share ε, and
 the derivatives by ε²: the second pass corrects the first.
 """
 
