@@ -86,9 +86,12 @@ def _norm_jvp(primals, tangents):
 
 @jax.custom_jvp
 def unit(v: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-    """Direction v/|v|; the zero vector has the direction zero, and derivative zero."""
-    # a zero vector times the inverse of the smallest number there is remains zero
-    return scale(1.0 / jnp.maximum(norm(v), jnp.finfo(v.dtype).tiny), v)
+    """Direction v/|v|; the zero vector has the direction zero, and derivative zero.
+
+    Vectors whose squares underflow (below 1e-19 in float32) have a rough direction, or a shorter one.
+    """
+    # at this floor the square underflows: the norm of what is shorter is zero, and its inverse would be anything
+    return scale(1.0 / jnp.maximum(norm(v), jnp.finfo(v.dtype).tiny ** 0.5), v)
 
 
 @unit.defjvp

@@ -175,6 +175,13 @@ def test_directions_have_length_one_however_short_or_long_the_vector(dim):
     np.testing.assert_allclose(norm(unit(v)), 1.0, rtol=4e-16, atol=0)
 
 
+def test_directions_stay_small_where_squares_underflow(precision):
+    least = np.log10(float(jnp.finfo(precision.dtype).smallest_subnormal))
+    v = jnp.outer(10.0 ** jnp.linspace(least, least / 4, 200), jnp.ones(3)).astype(precision.dtype)
+    direction = jax.jit(unit)(v)
+    assert jnp.all(jnp.abs(direction) < 1 + 4 * precision.eps)
+
+
 @pytest.mark.parametrize("function", [norm, unit], ids=["norm", "unit"])
 def test_value_and_derivatives_at_zero_are_zero_to_third_order(function, precision):
     first, first_reverse = jax.jacfwd(function), jax.jacrev(function)
