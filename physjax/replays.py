@@ -8,11 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 
 def differentiate_by_replay(
@@ -21,29 +22,36 @@ def differentiate_by_replay(
     """`find(*arguments)`, whose derivatives are those of a replay, forward and reverse, as far as the replay has them.
 
     Only where something is differentiated does `log(*arguments)` run instead, which returns what `find` does and a record
-    of what was chosen, and then `replay(record, *arguments)`, which returns the result again, finite everywhere. What the
-    three close over must not be differentiated: see `hoist_closures`.
+    of what was chosen, and then `replay(record, *arguments)`, which returns the result again; where it is a NaN, so are the
+    derivatives. What the three close over must not be differentiated: see `hoist_closures`.
     """
     leaves, structure = jax.tree.flatten(arguments)
     run = jax.custom_jvp(lambda *leaves: find(*structure.unflatten(leaves)))
+    # compiled as calls, so that they are traced once: loops around ask for the rule once for each of their fixed points
+    log_leaves = jax.jit(lambda *leaves: log(*structure.unflatten(leaves)))
+    replay_leaves = jax.jit(lambda record, *leaves: replay(record, *structure.unflatten(leaves)))
 
     def rule(primals: tuple, tangents: tuple) -> tuple:
-        result, record = log(*structure.unflatten(lax.stop_gradient(list(primals))))
+        result, record = log_leaves(*lax.stop_gradient(list(primals)))
         # what does not move stays a constant of the replay
         moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
 
         def again(*some: Any) -> PyTree:
             moved = dict(zip(moving, some, strict=True))
-            return replay(record, *structure.unflatten([moved.get(i, leaf) for i, leaf in enumerate(primals)]))
+            return replay_leaves(record, *(moved.get(i, leaf) for i, leaf in enumerate(primals)))
 
         some, pushes = tuple(primals[i] for i in moving), tuple(tangents[i] for i in moving)
         value, change = jax.jvp(again, some, pushes)
-        # the search's own number, to the last bit, with the derivatives of the replay
-        value = jax.tree.map(lambda found, flown: found + (flown - lax.stop_gradient(flown)), result, value)
-        return value, change
+        return jax.tree.map(_adopt_derivatives, result, value), change
 
     run.defjvp(rule, symbolic_zeros=True)
     return run(*leaves)
+
+
+def _adopt_derivatives(found: Array, flown: Array) -> Array:
+    """The search's own number, to the last bit, with the derivatives of the replay."""
+    change = flown - lax.stop_gradient(flown)
+    return found + jnp.where(jnp.isfinite(change), change, 0.0)
 
 
 def hoist_closures(

@@ -239,7 +239,7 @@ def adaptive(
     `averaged_over_step` nor `discontinuities` (see `Force`) can be stepped over. Forces with memory and contacts resolved
     by `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
     Timed contacts are counted per dt as well: a flight shorter than a quarter of dt is the last before rest, and after
-    eight contacts in one dt a lane waits for the next, so take a dt in which few bounces happen.
+    64 contacts in one dt (8 of a body) a lane waits for the next, so take a dt in which few bounces happen.
 
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]

@@ -17,8 +17,10 @@ from physjax.loops import Time
 from physjax.scene import Scene
 from physjax.vectors import dot
 
-MAX_IMPACTS = 8
-"""Impacts that one lane may have within one step; after the last it stays where it is, with its velocity, until the next."""
+MAX_IMPACTS = 64
+"""Impacts that a particle may have within one step; after the last it stays where it is, with its velocity, until the next."""
+MAX_DIFFERENTIATED_IMPACTS = 8
+"""Impacts of one step that have derivatives: a step keeps room for all of them in reverse mode. With more they are NaN."""
 SHORTEST_FLIGHT_SHARE = 0.25
 """A bounce whose flight would be shorter than this share of the step is the last: what would follow is summed up."""
 OVERRUN_ROUNDING = 64

@@ -25,7 +25,7 @@ from physjax.physics.contacts.impact_response import (
     respond_to_event,
     select_guard,
 )
-from physjax.physics.contacts.legs import MAX_IMPACTS, Flight, Motion, choose_lanes, shortest_duration
+from physjax.physics.contacts.legs import Flight, Motion, choose_lanes, shortest_duration
 from physjax.physics.contacts.search import Leg, Progress, find_events
 from physjax.physics.contacts.surfaces import Surfaces
 from physjax.scene import Scene
@@ -37,19 +37,19 @@ Total = TypeVar("Total")
 
 
 def log_events(
-    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, active: Array
+    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, active: Array, most: int
 ) -> tuple[Progress, Leg]:
-    """The step from event to event, and how each of its legs was flown, along a leading axis of legs."""
+    """The step from event to event, and how the legs up to its first `most` impacts were flown, along a leading axis."""
     none = jnp.zeros(dt.shape, bool)
     verdict = Verdict(jnp.zeros(dt.shape, jnp.int32), none, none, none)
     blank = Leg(jnp.zeros_like(dt), make_free_mode(scene, surfaces), verdict, none, jnp.zeros_like(dt))
-    empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (MAX_IMPACTS + 1, *leaf.shape)), blank)
+    empty = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (most + 1, *leaf.shape)), blank)
     return find_events(motion, scene, surfaces, t, dt, active, _log_leg, empty, slopes=True)
 
 
 def _log_leg(legs: Leg, ends: Array, number: Array, leg: Leg) -> Leg:
     """The log with a leg written at its number in the lanes in which it ends."""
-    here = ends[None] & (number[None] == jnp.arange(MAX_IMPACTS + 1, dtype=number.dtype).reshape(-1, *(1,) * ends.ndim))
+    here = ends[None] & (number[None] == jnp.arange(len(legs.slope), dtype=number.dtype).reshape(-1, *(1,) * ends.ndim))
     by_lane = lambda old, new: jnp.where(here, new[None], old)  # noqa: E731
     pressed = jnp.where(here[:, None], leg.mode.pressed[None], legs.mode.pressed)
     slip = legs.mode.slip
@@ -92,7 +92,7 @@ def replay_step(
         active = number < flown[0]
         return lax.cond(any_lane(active), lambda: fly(carry, leg, active), lambda: carry), None
 
-    numbers = jnp.arange(MAX_IMPACTS + 1, dtype=jnp.int32)
+    numbers = jnp.arange(len(flown[1].slope), dtype=jnp.int32)
     start = jnp.zeros_like(dt), scene.state, surfaces.touching_since, total
     (_, state, since, total), _ = lax.scan(go_on, start, (numbers, flown[1]))
     return state, since, total

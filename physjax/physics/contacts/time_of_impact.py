@@ -8,6 +8,7 @@ by lane, and of many lanes only those that meet something are computed again.
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
@@ -18,12 +19,21 @@ from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.parts import holds_user_code
 from physjax.physics.contacts.contact_mode import ContactMode, decide_contact_mode, make_free_mode, start_leg
-from physjax.physics.contacts.legs import Flight, Motion, choose_lanes, has_moved_over, invalidate_lanes
+from physjax.physics.contacts.legs import (
+    MAX_DIFFERENTIATED_IMPACTS,
+    MAX_IMPACTS,
+    Flight,
+    Motion,
+    choose_lanes,
+    has_moved_over,
+    invalidate_lanes,
+)
 from physjax.physics.contacts.replay import log_events, replay_step
 from physjax.physics.contacts.search import Leg, Progress, find_events
 from physjax.physics.contacts.surfaces import Surfaces
 from physjax.replays import differentiate_by_replay, hoist_closures
 from physjax.scene import Scene, trace_once
+from physjax.vectors import scale
 
 Total = TypeVar("Total")
 
@@ -32,11 +42,12 @@ Total = TypeVar("Total")
 def impact(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The response that finds the time of each impact within the step, bounces the lane there, and goes on from there.
 
-    For independent lanes, at most 8 impacts per lane and step. A lane that would have more waits where it is, with its
+    For independent lanes, at most 64 impacts per lane and step. A lane that would have more waits where it is, with its
     velocity, for the next step, so that nothing ever passes; where a moving surface overruns it as it waits, it becomes
-    NaN, which its status reports. Where the flight to the next bounce would be shorter than a quarter of a step, the
-    lane comes to rest: the bounces that remain take 2v/(g(1 - K_r)) more, which `touching_since` [s] records. From then
-    on the surface carries it, at rest or sliding, until a force lifts it off.
+    NaN, which its status reports. Derivatives of a step are NaN where a lane has more than 8. Where the flight to the
+    next bounce would be shorter than a quarter of a step, the lane comes to rest: the bounces that remain take
+    2v/(g(1 - K_r)) more, which `touching_since` [s] records. From then on the surface carries it, at rest or sliding,
+    until a force lifts it off.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, response=contacts.impact)
@@ -121,16 +132,19 @@ def _find_end(passage: _Passage) -> tuple[Particles, Array]:
 def _log_end(passage: _Passage) -> tuple[tuple[Particles, Array], tuple[Array, Leg]]:
     """The same, and a record for the replay."""
     motion, _, meets, scene, surfaces, t, dt = passage
-    progress, legs = log_events(motion, scene, surfaces, t, dt, meets)
+    progress, legs = log_events(motion, scene, surfaces, t, dt, meets, MAX_DIFFERENTIATED_IMPACTS)
     return _finish(passage, progress), (progress.legs, legs)
 
 
 def _replay_end(flown: tuple[Array, Leg], passage: _Passage) -> tuple[Particles, Array]:
-    """The same by a replay, differentiable; zero instead of infinite where there is no contact."""
+    """The same by a replay, differentiable."""
     motion, changing, meets, scene, surfaces, t, dt = passage
     state, since, _ = replay_step(motion, scene, surfaces, t, dt, flown, lambda nothing, _: nothing, ())
+    # a product: a NaN that is chosen has derivative zero
+    known = jnp.where(flown[0] > MAX_DIFFERENTIATED_IMPACTS + 1, jnp.nan, jnp.ones_like(dt))
+    state = jax.tree.map(lambda leaf: scale(known, leaf), state)
     since = jnp.where(meets[None], since, changing[1])
-    return choose_lanes(meets, state, changing[0]), jnp.where(jnp.isfinite(since), since, 0.0)
+    return choose_lanes(meets, state, changing[0]), since
 
 
 def _finish(passage: _Passage, progress: Progress) -> tuple[Particles, Array]:
@@ -155,7 +169,7 @@ def fold_flights(
     """The total of `total = add(total, flight)` over the legs of the step that `impact` takes, and the state after it."""
     surfaces, dt = _collect_surfaces(scene), jnp.broadcast_to(dt, scene.state.lanes)
     active = jnp.ones(dt.shape, bool)
-    progress, legs = log_events(motion, scene, surfaces, t, dt, active)
+    progress, legs = log_events(motion, scene, surfaces, t, dt, active, MAX_IMPACTS)
     flown = progress.legs, legs
     *_, total = replay_step(motion, scene, surfaces, t, dt, flown, add, total)
     return total, progress.state

@@ -18,7 +18,7 @@ from physjax.backend import any_lane, bounded_while_loop, materialise_where
 from physjax.loops import Time
 from physjax.particles import Particles
 from physjax.physics.contacts.events import Dip
-from physjax.physics.contacts.legs import MAX_IMPACTS, Motion, choose_lanes, shortest_duration
+from physjax.physics.contacts.legs import MAX_DIFFERENTIATED_IMPACTS, Motion, choose_lanes, shortest_duration
 from physjax.physics.rigid.point_contacts import (
     ContactKind,
     count_points,
@@ -38,7 +38,7 @@ from physjax.physics.rigid.spatial import RigidBodies
 from physjax.roots import Bracket
 from physjax.scene import Scene
 
-MAX_LEGS = MAX_IMPACTS + 1
+MAX_LEGS = MAX_DIFFERENTIATED_IMPACTS + 1
 """Legs of a step: from its start, and from each impact."""
 MAX_TURNS_PER_LEG = 64
 """Turns of the search that a leg may take, more than the bisection of a bracket down to rounding needs in float64."""

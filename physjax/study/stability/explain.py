@@ -82,7 +82,7 @@ class Explanation(NamedTuple):
             )
         return {
             "rounding": "Positions are so large that a step is lost in their rounding.",
-            "contact": "A surface passed over a lane that had used up the eight contacts of a step and waited for the next.",
+            "contact": "A surface passed over a lane that had used up the contacts of a step and waited for the next.",
             "error measure": "The error looks at velocities alone and cannot see that positions are wrong.",
             "input": "It starts non-finite: a traced number beyond its bounds, or a start on the wrong side of a contact.",
             "nothing": "Nothing was found wrong with the step.",
@@ -142,7 +142,7 @@ def _explain_run(run: Trajectory) -> Explanation:
     if isinstance(method, Adaptive):
         return _check_error_measure(run, method, sound)
     if _fails_in_contact(run, first):
-        return sound._replace(cause="contact", cures=("a shorter dt, of no more than eight contacts a step",))
+        return sound._replace(cause="contact", cures=("a shorter dt, with fewer contacts a step",))
     if _is_step_below_rounding(scene, step):
         return sound._replace(cause="rounding", cures=("compute in float64", "put the origin near the scene"))
     return _check_rates(run, sound)
