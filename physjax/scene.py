@@ -6,6 +6,7 @@ earlier axes count scenes. A per-lane number is a scalar or has the shape of the
 unless a force says otherwise.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -17,7 +18,7 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.backend import materialise, needs_split_compilation
+from physjax.backend import MIN_LANES_TO_SELECT, materialise, needs_split_compilation
 from physjax.loops import (
     RECORD,
     Time,
@@ -155,6 +156,12 @@ class Scene(eqx.Module):
     def compiles_in_pieces(self) -> bool:
         """Whether a step is compiled in pieces, as it is where more than a few nodes are coupled."""
         return needs_split_compilation(self.couples, self.state.lanes)
+
+    @property
+    def compile_bound(self) -> bool:
+        """Whether compiling a step costs more than taking it: few lanes, and contacts timed within the step."""
+        timed = any((contact.response or project) is not project for contact in self.contacts)
+        return timed and math.prod(self.state.lanes) < MIN_LANES_TO_SELECT
 
     def may_be_cut(self) -> bool:
         """Whether some lanes can be stepped without the rest: independent ones, and no part may hide an array of all lanes.

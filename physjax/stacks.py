@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 P = TypeVar("P")
 
@@ -53,9 +53,25 @@ def stack_alike(parts: Sequence[P]) -> tuple[Stack[P], ...]:
 
     def stack(places: list[int]) -> P:
         first, *others = [parts[place] for place in places]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), first, *others) if others else first
+        return jax.tree.map(_stack_leaves, first, *others) if others else first
 
     return tuple(Stack(stack(places), tuple(places)) for places in kinds.values())
+
+
+def _stack_leaves(*leaves: Array) -> Array:
+    """The leaves along a new leading axis: joined along the one they have, which takes no operation for each of them."""
+    if leaves[0].ndim == 0:
+        return jnp.stack(leaves)
+    return jnp.concatenate(leaves).reshape(len(leaves), *leaves[0].shape)
+
+
+def unstack(values: Array) -> list[Array]:
+    """The entries along the leading axis, one by one: cut from the first two axes as one, which takes one operation each."""
+    if values.ndim == 1:
+        return list(values)
+    count, size = values.shape[:2]
+    joined = values.reshape(count * size, *values.shape[2:])
+    return [joined[i * size : (i + 1) * size] for i in range(count)]
 
 
 def map_stacks(function: Callable[..., PyTree], stacks: Sequence[Stack[P]], *shared: PyTree) -> PyTree:

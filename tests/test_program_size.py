@@ -70,29 +70,29 @@ def measure(name, differentiated):
 
 
 FORWARD = {
-    "plane": 1549,
-    "room of 6": 2319,
-    "room of 60": 2711,
-    "planes and spheres": 3409,
+    "plane": 1339,
+    "room of 6": 1751,
+    "room of 60": 1873,
+    "planes and spheres": 2588,
     "fall_with_drag": 144,
     "flag": 2287,
-    "bouncing_ball": 1295,
-    "tumbling_box": 2903,
-    "ragdoll": 4398,
-    "car": 7001,
+    "bouncing_ball": 1134,
+    "tumbling_box": 2520,
+    "ragdoll": 2781,
+    "car": 5542,
 }
 """Operations of eight rk4 steps."""
 GRADIENT = {
-    "plane": 4992,
-    "room of 6": 9557,
-    "room of 60": 9952,
-    "planes and spheres": 14745,
+    "plane": 3735,
+    "room of 6": 5533,
+    "room of 60": 5658,
+    "planes and spheres": 8399,
     "fall_with_drag": 403,
     "flag": 8519,
-    "bouncing_ball": 4043,
-    "tumbling_box": 18089,
-    "ragdoll": 39158,
-    "car": 37311,
+    "bouncing_ball": 3152,
+    "tumbling_box": 15908,
+    "ragdoll": 26848,
+    "car": 27989,
 }
 """Operations of a value and its gradient by velocities."""
 

@@ -6,7 +6,6 @@ them in nested scans: memory O(frames + √save_every).
 """
 
 import functools
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,13 +19,13 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import MIN_LANES_TO_SELECT, jit_untransformed, split_compilation
+from physjax.backend import jit_untransformed, split_compilation
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
 from physjax.parts import as_module, find_plain_functions, holds_user_code
-from physjax.scene import Scene, project
+from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, select_stateful_parts
 
@@ -80,7 +79,7 @@ def simulate(
     warn_of_recompilation("simulate", (*(plain.function for plain in find_plain_functions((scene, method))), record))
     first_step, dt = _check_first_step(first_step, steps, dt)
     alone = record is None and _is_untransformed((scene, method, dt, first_step))
-    run = _get_standalone_run(_is_compile_bound(scene)) if alone else _run_inside
+    run = _get_standalone_run(scene.compile_bound) if alone else _run_inside
     return run(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
@@ -147,12 +146,6 @@ _run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
 def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
     """The compiled run where no transformation is around it; made at the first run, since it asks for the device."""
     return jit_untransformed(_run_steps, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
-
-
-def _is_compile_bound(scene: Scene) -> bool:
-    """Whether compiling costs more than running: few lanes, and contacts within the step, which are many small kernels."""
-    timed = any((contact.response or project) is not project for contact in scene.contacts)
-    return timed and math.prod(scene.state.lanes) < MIN_LANES_TO_SELECT
 
 
 def _is_untransformed(run: tuple) -> bool:

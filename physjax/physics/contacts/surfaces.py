@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from physjax.particles import Particles
 from physjax.physics.contacts.face import ContactFace
-from physjax.stacks import Stack, map_stacks, stack_alike
+from physjax.stacks import Stack, map_stacks, stack_alike, unstack
 from physjax.vectors import broadcast_vector
 
 
@@ -63,7 +63,8 @@ class Surfaces(eqx.Module):
     def in_scene_order(self, values: Array) -> list[Array]:
         """Values of every surface, listed in the order in which the scene has the surfaces."""
         places = [place for stack in self.stacks for place in stack.places]
-        return [values[places.index(place)] for place in range(len(places))]
+        each = unstack(values)
+        return [each[places.index(place)] for place in range(len(places))]
 
     def facing(self, t: ArrayLike, position: Array) -> "Surfaces":
         """The surfaces as each lane meets them from where it is: of a slab, the nearer face."""
