@@ -1,10 +1,12 @@
 """Tests run in float64 with strict dtype and rank promotion, and with every shape annotation of physjax executed.
 
-`precision` runs a test twice: in float64, and in float32 with 64-bit types off, which is what games run in.
+`precision` runs a test twice: in float64, and in float32 with 64-bit types off, which is what games run in. What
+`slow.txt` lists is slow as if it were marked so: the default run has some of every kind, and ends within minutes.
 """
 
 import os
 import tempfile
+from pathlib import Path
 from typing import NamedTuple
 
 # one thread per worker: the workers fill the cores, and threads that spin for each other double the time of the suite
@@ -27,6 +29,17 @@ with jaxtyping.install_import_hook("physjax", "beartype.beartype"):
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+SLOW = {line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#")}
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    for item in items:
+        name = item.nodeid.removeprefix("tests/")
+        if name in SLOW or name.partition("[")[0] in SLOW:
+            item.add_marker(pytest.mark.slow)
 
 
 class Precision(NamedTuple):
