@@ -151,23 +151,11 @@ def _advance(
     # lanes wait for those that refine, so that what only a new leg needs is computed once for all of them
     tries, leg_start = going & ~any_lane(refining), t + now.elapsed
     rest = jnp.maximum(dt - now.elapsed, shortest_duration(dt))
-    here = scene.replace(state=now.state)
-    # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
-    touches = tries & jnp.any(jnp.isfinite(now.since), axis=0) & scene.finite(now.state)
     start_time = to_float_time(leg_start)
     faces = surfaces.facing(start_time, now.state.position)
-
-    def decide() -> tuple[ContactMode, Particles]:
-        touch = faces.measure(start_time, now.state)
-        mode = decide_contact_mode(here, faces, touch, now.since, leg_start, rest)
-        return mode, put_on_surfaces(faces, touch, mode, now.state)
-
-    free = make_free_mode(scene, surfaces), now.state
-    decided, put = materialise_where(touches, decide, free)
-    mode = choose_mode(tries, decided, now.mode)
+    mode, state = _begin_leg(scene, faces, now, tries, leg_start, rest)
     since = jnp.where(mode.pressed, now.since, jnp.inf)
-    # a lane that refines begins where it was put when it tried
-    held = apply_contact_mode(scene.replace(state=choose_lanes(tries, put, now.state)), faces, mode)
+    held = apply_contact_mode(scene.replace(state=state), faces, mode)
     shortest = shortest_duration(dt)
     duration = jnp.where(refining, jnp.maximum(now.bracket.next, shortest), rest)
     end = materialise_where(tries | refining, lambda: motion(held, leg_start, duration).state, now.state)
@@ -197,6 +185,22 @@ def _advance(
             found, lambda: _measure_slope(motion, held, faces, leg_start, duration, verdict.guard)
         )
     return after, Leg(duration, mode, verdict, arrives, slope)
+
+
+def _begin_leg(
+    scene: Scene, faces: Surfaces, now: Progress, tries: Array, leg_start: Time, rest: Array
+) -> tuple[ContactMode, Particles]:
+    """The contact mode of every lane, and its state put onto what it presses on; a lane that refines keeps its own."""
+    # a non-finite lane rests nowhere, or the others would take the other branch, with other rounding, because of it
+    touches = tries & jnp.any(jnp.isfinite(now.since), axis=0) & scene.finite(now.state)
+
+    def decide() -> tuple[ContactMode, Particles]:
+        here, touch = scene.replace(state=now.state), faces.measure(to_float_time(leg_start), now.state)
+        mode = decide_contact_mode(here, faces, touch, now.since, leg_start, rest)
+        return mode, put_on_surfaces(faces, touch, mode, now.state)
+
+    mode, put = materialise_where(touches, decide, (make_free_mode(scene, faces), now.state))
+    return choose_mode(tries, mode, now.mode), choose_lanes(tries, put, now.state)
 
 
 def _measure_slope(
