@@ -115,7 +115,8 @@ def splits_vectors() -> bool:
     """Whether the vectors of a step are carried and computed as one array for each component.
 
     On a GPU an operation on `(lanes, dim)` arrays gives each component a thread of its own, which computes the whole
-    lane again wherever a length is needed.
+    lane again wherever a length is needed. On a CPU it is a matter of versions: 65 536 flights run 0.9 (jax 0.10) and 1.1
+    times (0.12) as fast, timed impacts 0.8 times, and the first run takes up to 1.9 times as long.
     """
     return not on_cpu() and not jit_is_disabled()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from physjax import Particles, Scene, contacts, forces, inertia, methods, rigid
+from physjax import Particles, Scene, backend, contacts, forces, inertia, methods, rigid
 from physjax.backend import any_lane, block_fusion, splits_vectors
 from physjax.components import compute_by_components, forget_wholes, join_vectors, split_vectors
 from physjax.components.values import Split, is_stored
@@ -317,6 +317,28 @@ def test_runs_in_a_batch_are_the_same(monkeypatch):
 
     pushes = jnp.arange(1.0, 4.0)
     assert_close(jax.vmap(partial(end, True))(pushes), jax.vmap(partial(end, False))(pushes))
+
+
+@pytest.mark.parametrize("way", ["frames", "blocks of lanes", "a record"])
+def test_frames_are_whole_again(way, monkeypatch):
+    scene = Scene(throws(3, lanes=5), 2.0, (forces.Gravity(), forces.QuadraticDrag(0.1, 0.4, **WIND)))
+    if way == "blocks of lanes":
+        monkeypatch.setattr("physjax.stepping.blocks.count_lane_blocks", lambda lanes, steps: 2)
+    record = (lambda t, state: (t, state.position)) if way == "a record" else None
+
+    def frames(scene, split):
+        monkeypatch.setattr(loop, "splits_vectors", lambda: split)
+        flight = loop._run_steps(scene, as_module(methods.midpoint), jnp.asarray(0.05), jnp.int32(0), 3, 2, record)
+        return flight.recorded if record else flight.state, flight.final_scene.state
+
+    assert_close(*jax.jit(lambda scene: [frames(scene, split) for split in (True, False)])(scene))
+
+
+def test_vectors_are_split_where_the_device_is_no_cpu(monkeypatch):
+    monkeypatch.setattr(backend, "device_kind", lambda: "gpu")
+    assert splits_vectors()
+    with jax.disable_jit():
+        assert not splits_vectors()
 
 
 def test_on_a_cpu_vectors_stay_whole():
