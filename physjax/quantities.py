@@ -57,6 +57,20 @@ class Number(NamedTuple):
         entries = self.quantity.per in (*PER_LANE, "spring", "memory")
         return entries and np.ndim(self.value) > own and np.shape(self.value)[: len(lanes)] == lanes
 
+    def is_vector(self, lanes: tuple[int, ...], dim: int) -> bool:
+        """Whether its last axis counts the components of a vector: of a record it comes after those of the lanes."""
+        shape = np.shape(self.value)
+        if self.quantity is None:
+            return self.owner is None and len(shape) == len(lanes) + 1 and shape[:-1] == lanes
+        own = self.quantity.axes(dim)
+        return len(own) == 1 and shape[-1:] == own
+
+
+def build_vector_mask(tree: PyTree, lanes: tuple[int, ...], dim: int) -> PyTree:
+    """The tree with True in place of each array whose last axis counts the components of a vector, False elsewhere."""
+    found, structure = collect_numbers(tree)
+    return structure.unflatten([number.is_vector(lanes, dim) for number in found])
+
 
 def collect_numbers(tree: PyTree) -> tuple[list[Number], PyTree]:
     """Every leaf of a tree of parts with its declaration, the innermost on the way to it; and the tree's structure."""

@@ -44,7 +44,13 @@ from physjax.parts import (
     unify_gravity,
 )
 from physjax.pins import Pins
-from physjax.quantities import build_lane_mask, demand_fitting_numbers, mark_invalid_lanes, may_hide_lanes
+from physjax.quantities import (
+    build_lane_mask,
+    build_vector_mask,
+    demand_fitting_numbers,
+    mark_invalid_lanes,
+    may_hide_lanes,
+)
 
 
 def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
@@ -174,6 +180,10 @@ class Scene(eqx.Module):
     def build_lane_mask(self, tree: PyTree) -> PyTree:
         """The tree with True in place of each array that has an entry for each lane of this scene, False elsewhere."""
         return build_lane_mask(tree, self.state.lanes, self.state.position.shape[-1])
+
+    def build_vector_mask(self, tree: PyTree) -> PyTree:
+        """The tree with True in place of each array whose last axis counts the components of a vector, False elsewhere."""
+        return build_vector_mask(tree, self.state.lanes, self.state.position.shape[-1])
 
     @property
     def remembers(self) -> bool:

@@ -24,7 +24,20 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FIL
 
 FLOORS = (
     {"backend"},
-    {"vectors", "checks", "files", "text", "timing", "loops", "linear", "closures", "lazy", "mesh_files", "old_names"},
+    {
+        "vectors",
+        "checks",
+        "files",
+        "text",
+        "timing",
+        "loops",
+        "linear",
+        "closures",
+        "lazy",
+        "mesh_files",
+        "old_names",
+        "components",
+    },
     {"roots", "cubics", "meshes", "projectile", "compiling", "stacks", "replays"},
     {"particles", "quantities"},
     {"parts"},

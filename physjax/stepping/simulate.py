@@ -19,10 +19,11 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import jit_untransformed, split_compilation
+from physjax.backend import jit_untransformed, split_compilation, splits_vectors
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
+from physjax.components import compute_by_components, forget_wholes, join_vectors, split_vectors
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
 from physjax.parts import as_module, find_plain_functions, holds_user_code
 from physjax.scene import Scene
@@ -101,21 +102,32 @@ def _run_steps(
         return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
 
     blocks = Blocks.of(scene, moving, frame_steps=save_every) if record is None else None
+    prepare = partial(_prepare_steps, step, scene.build_vector_mask((moving, still)) if splits_vectors() else None)
+
+    def step_block(moving: PyTree, still: PyTree, dt: Array, first: Array) -> PyTree:
+        advance, start = prepare(moving, still, dt)
+        return join_vectors(repeat_steps(advance, start, first, save_every))
+
+    if blocks is None:
+        advance, start = prepare(moving, still, dt)
+        step_all = lambda moving, first: repeat_steps(advance, moving, first, save_every)  # noqa: E731
+    else:
+        start, lanes = blocks.cut(moving), scene.build_lane_mask((still, dt))
+        step_all = lambda moving, first: blocks.map(  # noqa: E731
+            partial(step_block, first=first), moving, still, dt, masks=lanes
+        )
 
     def frame(moving: PyTree, index: Array) -> tuple[PyTree, PyTree]:
         first = first_step + index * save_every
-        if blocks is None:
-            moving = repeat_steps(partial(step, still=still, dt=dt), moving, first, save_every)
-        else:
-            moving = blocks.map(
-                lambda m, s, h: repeat_steps(partial(step, still=s, dt=h), m, first, save_every),
-                moving, still, dt, masks=scene.build_lane_mask((still, dt)),
-            )  # fmt: skip
-        return moving, moving if record is None else record(clock(first + save_every), eqx.combine(moving, still).state)
+        moving = step_all(moving, first)
+        if record is None:
+            return moving, moving
+        return moving, record(clock(first + save_every), eqx.combine(join_vectors(moving), still).state)
 
-    start = moving if blocks is None else blocks.cut(moving)
     last, kept = lax.scan(frame, start, jnp.arange(frames, dtype=jnp.int32))
-    if blocks is not None:
+    if blocks is None:
+        last, kept = join_vectors(last), join_vectors(kept) if record is None else kept
+    else:
         last, kept = blocks.join(last), blocks.join(kept, leading=1)
     first_kept = moving if record is None else record(clock(first_step), scene.state)
     kept = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first_kept, kept)
@@ -135,6 +147,20 @@ def _run_steps(
         save_every=save_every,
         steps=frames * save_every,
     )
+
+
+def _prepare_steps(
+    step: Callable, vectors: tuple[PyTree, PyTree] | None, moving: PyTree, still: PyTree, dt: Array
+) -> tuple[Callable, PyTree]:
+    """A step `(number, moving) -> moving` and what it starts from: split into components where masks of vectors are given.
+
+    What does not change is split here, before the loop.
+    """
+    if vectors is None:
+        return partial(step, still=still, dt=dt), moving
+    start, still = forget_wholes(split_vectors(moving, vectors[0])), split_vectors(still, vectors[1])
+    by_components = compute_by_components(step, jnp.zeros((), jnp.int32), start, still, dt, like=start)
+    return lambda i, moving: by_components(i, moving, still, dt), start
 
 
 RUN_STRUCTURE = ("frames", "save_every", "record")

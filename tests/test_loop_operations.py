@@ -1,0 +1,100 @@
+"""What a GPU would suffer from is counted in lowered programs, as if for one, so that it is seen without one.
+
+`python tests/test_loop_operations.py` prints the table anew.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from loop_operations import LoopCounts, count_in_loops
+
+from physjax import Particles, Scene, backend, contacts, emitters, forces, inertia, lattices, methods, rigid, simulate
+
+LANES = 4099
+"""As many as are picked in groups where few are flagged; no other axis of a program has this length."""
+DRAG = (forces.Gravity(), forces.QuadraticDrag(0.01, 0.5, wind=(1.0, 0.0, 0.0)))
+
+
+def throws(dim=3):
+    x, v = np.random.default_rng(0).normal(size=(2, LANES, dim))
+    return Particles(jnp.asarray(x + 10 * np.eye(dim)[1]), jnp.asarray(v))
+
+
+def floor(**options):
+    return (contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.8, **options),)
+
+
+def build_cloth():
+    cloth = lattices.cloth(2.0, 1.0, rows=19, columns=23, mass=0.6, structural=100.0, shear=50.0)
+    return Scene(cloth.state, cloth.mass, (forces.Gravity(), cloth.springs), pinned=cloth.nodes["top"])
+
+
+def build_fountain():
+    source = emitters.Emitter(LANES, emitters.Point((0.0, 0.0, 0.0)), key=0, life=1.0, speed=5.0, rate=1000.0)
+    still = Particles(jnp.zeros((LANES, 3)), jnp.zeros((LANES, 3)))
+    return Scene(still, 1.0, DRAG, floor(response=contacts.project), emitter=source)
+
+
+def build_boxes():
+    brick = inertia.box(2.0, (1.0, 2.0, 3.0))
+    bodies = rigid.bodies(brick, np.zeros((LANES, 3)), angular_velocity=(1.0, 2.0, 3.0))
+    return Scene(bodies, brick, (forces.Gravity(),))
+
+
+WORKLOADS = {
+    "flight": (lambda: Scene(throws(), 1.0, (*DRAG, forces.Magnus(1e-3, 0.2, (0.0, 0.0, 1.0)))), methods.rk4),
+    "fall in the plane": (lambda: Scene(throws(2), 1.0, (forces.Gravity(), forces.StokesDrag(0.1))), methods.verlet),
+    "n-body": (lambda: Scene(throws(), 1.0, (forces.Gravitation(1.0, softening=0.1),)), methods.leapfrog),
+    "cloth": (build_cloth, methods.semi_implicit_euler),
+    "projected contact": (lambda: Scene(throws(), 1.0, DRAG, floor(response=contacts.project)), methods.rk4),
+    "timed impacts": (lambda: Scene(throws(), 1.0, DRAG, floor()), methods.rk4),
+    "emitter": (build_fountain, methods.verlet),
+    "adaptive steps": (lambda: Scene(throws(), 1.0, DRAG), methods.adaptive(methods.rk4)),
+    "implicit steps": (lambda: Scene(throws(), 1.0, DRAG), methods.implicit_euler),
+    "free bodies": (build_boxes, methods.rk4),
+}
+
+
+def measure(name, monkeypatch, steps=8):
+    """The counts of a run of some steps, lowered as if for a GPU."""
+    monkeypatch.setattr(backend, "device_kind", lambda: "gpu")
+    build, method = WORKLOADS[name]
+    with jax.enable_x64(False):
+        scene = build()
+        program = jax.jit(lambda scene: simulate(scene, method, dt=0.01, steps=steps, save_every=4).state).lower(scene)
+    return count_in_loops(program, scene.state.position.shape[0])
+
+
+COUNTS = {
+    "flight": LoopCounts(on_vectors=0, branches=0, loops=1),
+    "fall in the plane": LoopCounts(on_vectors=0, branches=0, loops=1),
+    "n-body": LoopCounts(on_vectors=0, branches=0, loops=2),
+    "cloth": LoopCounts(on_vectors=17, branches=0, loops=1),
+    "projected contact": LoopCounts(on_vectors=0, branches=0, loops=1),
+    "timed impacts": LoopCounts(on_vectors=4, branches=24, loops=9),
+    "emitter": LoopCounts(on_vectors=16, branches=3, loops=8),
+    "adaptive steps": LoopCounts(on_vectors=0, branches=0, loops=2),
+    "implicit steps": LoopCounts(on_vectors=0, branches=0, loops=1),
+    "free bodies": LoopCounts(on_vectors=0, branches=0, loops=1),
+}
+"""In the loop over steps; the loop itself is one of the loops."""
+
+
+@pytest.mark.parametrize("name", WORKLOADS)
+def test_a_step_holds_no_more_of_what_slows_a_gpu(name, monkeypatch):
+    found = measure(name, monkeypatch)
+    assert all(count <= most for count, most in zip(found, COUNTS[name], strict=True)), found
+
+
+@pytest.mark.parametrize("name", ["flight", "fall in the plane"])
+def test_whole_vectors_are_seen_where_nothing_splits_them(name, monkeypatch):
+    monkeypatch.setattr("physjax.components.interpreter.ARRAY_RULES", {})
+    # a run of another length is traced anew
+    assert measure(name, monkeypatch, steps=12).on_vectors > 20
+
+
+if __name__ == "__main__":
+    with pytest.MonkeyPatch.context() as patch:
+        for name in WORKLOADS:
+            print(f'    "{name}": {measure(name, patch)},', flush=True)
