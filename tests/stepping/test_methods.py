@@ -16,7 +16,9 @@ from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import sample_states
 from physjax.vectors import dot, norm
 
-ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+UNCHARTED = (methods.heun, methods.tsit5, methods.dopri8, methods.blanes_moan4, methods.kahan_li8)
+EVERY = {**METHODS, **{method.__name__: method for method in UNCHARTED}}
+ALL = pytest.mark.parametrize("method", EVERY.values(), ids=EVERY)
 
 
 def thrown(method, dt, steps, dtype=float):
@@ -35,11 +37,16 @@ def thrown(method, dt, steps, dtype=float):
         ("leapfrog", 0),
         ("rk4", 0),
         ("implicit_euler", -0.5),
+        ("heun", 0),
+        ("tsit5", 0),
+        ("dopri8", 0),
+        ("blanes_moan4", 0),
+        ("kahan_li8", 0),
     ],
 )
 def test_constant_acceleration_is_exact_or_off_by_exactly_half_a_step(name, share, precision):
     dt, steps = 0.125, 64
-    flight = thrown(METHODS[name], dt, steps, precision.dtype)
+    flight = thrown(EVERY[name], dt, steps, precision.dtype)
     t = np.asarray(flight.time, float)
     exact = 4.0 * t - 4.9 * t**2 + share * 9.8 * dt * t
     np.testing.assert_allclose(flight.position[:, 1], exact, atol=64 * 400 * precision.eps, rtol=0)
@@ -61,8 +68,15 @@ def test_evaluations_a_step(method):
         return -state.position
 
     scene = Scene(Particles(jnp.ones(1), jnp.zeros(1)), forces=(counted,))
-    method(scene, 0.0, scene.state, 0.1)
+    with jax.disable_jit():  # loops over stages are then taken
+        method(scene, 0.0, scene.state, 0.1)
     assert len(calls) == method.promises.evaluations
+
+
+STRIP = {"blanes_moan4": (1.0003, 1.0006, 1.001), "kahan_li8": (1.005, 1.01)}
+"""Shares of the limit where an oscillation grows: further on it is kept again."""
+SLOWLY_UNSTABLE = ("tsit5", "dopri8")
+"""An oscillation grows by less than 2e-4 a step, which a run does not show, long before it grows."""
 
 
 @ALL
@@ -77,19 +91,23 @@ def test_stable_to_its_limit_and_not_beyond(method):
     if math.isinf(limit):
         for step in (0.01, 1.0, 1e3):
             assert radius(step) == pytest.approx(1 / math.hypot(1, step), rel=1e-12)
+    elif method.__name__ in SLOWLY_UNSTABLE:
+        assert radius(0.98 * limit) < 1 + 2e-4 < radius(1.02 * limit)
     elif limit:
         assert radius(0.98 * limit) <= 1 + 1e-12
-        assert radius(1.02 * limit) > 1 + 1e-3
+        beyond = max(radius(share * limit) for share in STRIP.get(method.__name__, (1.02,)))
+        assert beyond > 1 + 1e-3
     else:
         assert radius(0.1) > 1 + 1e-6
 
 
 def test_constant_velocity_is_exact_to_rounding_under_every_method(precision):
     x, v = jnp.asarray([[1.0, 2.0, 3.0]], precision.dtype), jnp.asarray([[3.0, -4.0, 0.5]], precision.dtype)
-    for method in METHODS.values():
+    for method in EVERY.values():
         film = simulate(Scene(Particles(x, v)), method, dt=0.125, steps=64)
         exact = np.asarray(x) + np.asarray(v) * np.asarray(film.time)[:, None, None]
-        np.testing.assert_allclose(film.position, exact, atol=64 * 32 * precision.eps, rtol=0)
+        roundings = 32 * max(1, method.promises.evaluations // 8)  # a composition drifts twice a stage
+        np.testing.assert_allclose(film.position, exact, atol=64 * roundings * precision.eps, rtol=0)
         np.testing.assert_array_equal(film.velocity, np.tile(v, (65, 1, 1)))
 
 
@@ -133,15 +151,24 @@ def pendulum(request):
     return scene, jax.tree.map(lambda leaf: leaf[-1], truth), request.param is WITH_DRAG
 
 
+COARSE = {"tsit5": (64, 128, 256), "blanes_moan4": (64, 128, 256), "dopri8": (16, 32), "kahan_li8": (16, 32)}
+"""Steps, where more of them would leave an error of rounding."""
+
+
 @ALL
 def test_order_is_the_promised_one(method, pendulum):
     scene, truth, drag = pendulum
     promised = method.promises.order_with_drag if drag else method.promises.order
     errors = []
-    for steps in (256, 512, 1024):
+    fine = (256, 512, 1024)
+    for steps in fine if promised == 1 else COARSE.get(method.__name__, fine):
         found = sample_states(scene, as_module(method), 2.0 / steps, steps, frames=1)
         errors.append(max(np.abs(a[-1] - b).max() for a, b in zip(found, truth, strict=True)))
-    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), promised, rtol=0, atol=0.15)
+    found = np.log2(np.divide(errors[:-1], errors[1:]))
+    if promised <= 4:
+        np.testing.assert_allclose(found, promised, rtol=0, atol=0.15)
+    else:  # terms of higher order are still seen where that of the order itself is small
+        assert found.min() > promised - (0.15 if promised < 6 else 0.3)
 
 
 class Classical(diffrax.AbstractERK):
@@ -159,8 +186,18 @@ class Classical(diffrax.AbstractERK):
         return 4
 
 
-@pytest.mark.parametrize(("method", "solver"), [(methods.euler, diffrax.Euler()), (methods.rk4, Classical())])
-def test_euler_and_rk4_equal_diffrax_after_1000_steps(method, solver):
+PAIRS = [
+    (methods.euler, diffrax.Euler()),
+    (methods.midpoint, diffrax.Midpoint()),
+    (methods.heun, diffrax.Heun()),
+    (methods.rk4, Classical()),
+    (methods.tsit5, diffrax.Tsit5()),
+    (methods.dopri8, diffrax.Dopri8()),
+]
+
+
+@pytest.mark.parametrize(("method", "solver"), PAIRS)
+def test_runge_kutta_methods_equal_diffrax_after_1000_steps(method, solver):
     dt, steps = 1 / 256, 1000
     state = Particles(jnp.asarray([0.8, -0.3]), jnp.asarray([0.4, 0.9]))
     scene = Scene(state, mass=0.7, forces=WITH_DRAG)
