@@ -18,7 +18,7 @@ from physjax.loops import Time, moment_at, to_float_time
 from physjax.particles import demand_particles
 from physjax.parts import Force, as_module
 from physjax.scene import Scene, project
-from physjax.stepping.registry import PromisingMethod
+from physjax.stepping.registry import read_promises
 from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
 from physjax.vectors import add_trailing_axes, norm
 
@@ -259,9 +259,11 @@ def adaptive(
     module = as_module(method)
     if error not in ("state", "velocity"):
         raise ValueError(f"error: got {error!r}, expected 'state' or 'velocity' (the lecture's).")
-    promised = method.promises.order if isinstance(method, PromisingMethod) else None
-    if order is None and promised is None:
-        raise ValueError("adaptive: the method promises no order. Give order=.")
+    if order is None:
+        promises = read_promises(method)
+        if promises is None:
+            raise ValueError("adaptive: the method promises no order. Give order=.")
+        order = promises.order
     atol, rtol = as_real_quantity("atol", atol, above=0.0), as_real_quantity("rtol", rtol, above=0.0)
     dt_min, dt_max = (
         None if h is None else as_real_quantity(name, h, above=0.0)
@@ -277,7 +279,7 @@ def adaptive(
         rtol,
         dt_min,
         dt_max,
-        as_positive_integer("order", promised if order is None else order),
+        as_positive_integer("order", order),
         error,
         None if tries is None else as_positive_integer("tries", tries),
     )

@@ -25,13 +25,6 @@ class Promises(NamedTuple):
     order_with_drag: int
 
 
-@runtime_checkable
-class PromisingMethod(Protocol):
-    """A method that says what it promises, as all of the library's do but those that subdivide a step."""
-
-    promises: Promises
-
-
 def promises(
     *, order: int, evaluations: int, stability_limit: float, order_with_drag: int | None = None, charted: bool = True
 ) -> Callable[[Callable], Callable]:
@@ -56,7 +49,7 @@ def promises(
 
 @runtime_checkable
 class Promising(Protocol):
-    """A method that makes promises; a user's own function need not."""
+    """A method that says what it promises, as all of the library's do but those that subdivide a step."""
 
     promises: Promises
 

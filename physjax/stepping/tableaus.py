@@ -22,7 +22,6 @@ class Tableau(NamedTuple):
     """Nodes, rows, weights [1] and the order of an explicit Runge-Kutta method, row i of length i.
 
     `errors`, of a pair, are its weights less those of the lower order: what is left is the error of a step.
-    `first_same_as_last`: the last slope is that at the end of the step, so that the next one may begin with it.
     """
 
     nodes: tuple[float, ...]
@@ -30,7 +29,11 @@ class Tableau(NamedTuple):
     weights: tuple[float, ...]
     order: int
     errors: tuple[float, ...] = ()
-    first_same_as_last: bool = False
+
+    @property
+    def first_same_as_last(self) -> bool:
+        """Whether the last slope is that at the end of the step, so that the next one may begin with it."""
+        return self.rows[-1] != () and self.weights == (*self.rows[-1], 0.0)
 
     @property
     def stages(self) -> int:
@@ -109,6 +112,15 @@ RK4 = Tableau(
     order=4,
 )
 """W. Kutta, 1901."""
+TSIT5_END = (
+    0.09646076681806523,
+    0.01,
+    0.4798896504144996,
+    1.379008574103742,
+    -3.290069515436081,
+    2.324710524099774,
+)
+"""Its last row, and its weights: the last slope is that at the end."""
 TSIT5 = Tableau(
     nodes=(0.0, 0.161, 0.327, 0.9, 0.9800255409045097, 1.0, 1.0),
     rows=(
@@ -118,17 +130,9 @@ TSIT5 = Tableau(
         (2.8971530571054935, -6.359448489975075, 4.3622954328695815),
         (5.325864828439257, -11.748883564062828, 7.4955393428898365, -0.09249506636175525),
         (5.86145544294642, -12.92096931784711, 8.159367898576159, -0.071584973281401, -0.028269050394068383),
-        (0.09646076681806523, 0.01, 0.4798896504144996, 1.379008574103742, -3.290069515436081, 2.324710524099774),
+        TSIT5_END,
     ),
-    weights=(
-        0.09646076681806523,
-        0.01,
-        0.4798896504144996,
-        1.379008574103742,
-        -3.290069515436081,
-        2.324710524099774,
-        0.0,
-    ),
+    weights=(*TSIT5_END, 0.0),
     order=5,
     errors=(
         0.0017800110522257773,
@@ -139,9 +143,24 @@ TSIT5 = Tableau(
         0.45808210592918686,
         -0.015151515151515152,
     ),
-    first_same_as_last=True,
 )
 """Ch. Tsitouras, Runge-Kutta pairs of order 5(4), Comput. Math. Appl. 62 (2011) 770."""
+DOPRI8_END = (
+    0.041747491141530244,
+    0.0,
+    0.0,
+    0.0,
+    0.0,
+    -0.05545232861123931,
+    0.2393128072011801,
+    0.703510669403443,
+    -0.7597596138144609,
+    0.6605630309222863,
+    0.15818748251012332,
+    -0.2381095387528628,
+    0.25,
+)
+"""Its last row, and its weights: the last slope is that at the end."""
 DOPRI8 = Tableau(
     nodes=(
         0.0,
@@ -236,38 +255,9 @@ DOPRI8 = Tableau(
             0.17589857770794226,
             0.0,
         ),
-        (
-            0.041747491141530244,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            -0.05545232861123931,
-            0.2393128072011801,
-            0.703510669403443,
-            -0.7597596138144609,
-            0.6605630309222863,
-            0.15818748251012332,
-            -0.2381095387528628,
-            0.25,
-        ),
+        DOPRI8_END,
     ),
-    weights=(
-        0.041747491141530244,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        -0.05545232861123931,
-        0.2393128072011801,
-        0.703510669403443,
-        -0.7597596138144609,
-        0.6605630309222863,
-        0.15818748251012332,
-        -0.2381095387528628,
-        0.25,
-        0.0,
-    ),
+    weights=(*DOPRI8_END, 0.0),
     order=8,
     errors=(
         0.012194277465176744,
@@ -285,6 +275,5 @@ DOPRI8 = Tableau(
         0.25,
         0.0,
     ),
-    first_same_as_last=True,
 )
 """P. Prince and J. Dormand, J. Comput. Appl. Math. 7 (1981) 67."""
