@@ -83,16 +83,16 @@ FORWARD = {
 }
 """Operations of eight rk4 steps."""
 GRADIENT = {
-    "plane": 3735,
-    "room of 6": 5533,
-    "room of 60": 5658,
-    "planes and spheres": 8399,
+    "plane": 2920,
+    "room of 6": 4290,
+    "room of 60": 4415,
+    "planes and spheres": 6595,
     "fall_with_drag": 403,
     "flag": 8519,
-    "bouncing_ball": 3152,
-    "tumbling_box": 15908,
+    "bouncing_ball": 2486,
+    "tumbling_box": 13404,
     "ragdoll": 26848,
-    "car": 27989,
+    "car": 23516,
 }
 """Operations of a value and its gradient by velocities."""
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from physjax.replays import differentiate_by_replay, hoist_closures
+from physjax.replays import Record, Replay, differentiate_by_replay, hoist_closures
 
 
 def search(number, function):
@@ -21,17 +21,19 @@ def search(number, function):
 
 
 def root_of(function, solve, *probe):
-    """A root whose replay is two Newton steps from what the search has found."""
+    """A root as the duration of one leg, which ends where the function has reached the number."""
 
     def log(number):
-        return search(number, function), search(number, function)
+        x = search(number, function)
+        return x, Record(jnp.zeros(1), x[None], (), jnp.ones(1, bool))
 
-    def replay(x, number):
-        slope = lax.stop_gradient(jax.grad(function)(x))
-        for _ in range(2):
-            x = x - (function(x) - number) / slope
-        return x
-
+    replay = Replay(
+        begin=jnp.zeros_like,
+        prepare=lambda choices, start, number: number,
+        fly=lambda choices, number, duration, _: ((), number - function(duration)),
+        respond=lambda choices, prepared, duration, end, _: duration,
+        finish=lambda record, last: last,
+    )
     return lambda number: solve(*probe, lambda number: search(number, function), log, replay, number)
 
 

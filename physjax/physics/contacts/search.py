@@ -8,7 +8,6 @@ however many surfaces there are. Nothing here has derivatives: those are carried
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
@@ -33,7 +32,6 @@ from physjax.physics.contacts.impact_response import (
     measure_last_flights,
     meet_surface,
     respond_to_event,
-    select_guard,
     update_contact_starts,
 )
 from physjax.physics.contacts.legs import MAX_IMPACTS, Motion, choose_lanes, shortest_duration
@@ -73,17 +71,12 @@ class Bracket(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """How a leg was flown: for how long [s], in which contact mode, what ended it, and whether that was the step's end.
-
-    `slope` [1/s] is the derivative of the guard that ended it by the duration, along the method's own step; zero where it
-    is not asked for.
-    """
+    """How a leg was flown: for how long [s], in which contact mode, what ended it, and whether that was the step's end."""
 
     duration: Array
     mode: ContactMode
     verdict: Verdict
     arrives: Bool[Array, "*lanes"]
-    slope: Array
 
 
 class Progress(NamedTuple):
@@ -116,15 +109,12 @@ def find_events(
     t: Time,
     dt: Array,
     active: Array,
-    log: Callable[[Tree, Array, Array, Leg], Tree],
+    log: Callable[[Tree, Progress, Progress, Leg], Tree],
     logged: Tree,
-    *,
-    slopes: bool = False,
 ) -> tuple[Progress, Tree]:
     """The step of lanes that are active, from event to event, at most `MAX_IMPACTS` of them.
 
-    Each leg that ends is handed to `log(logged, ends, number, leg)`, with the lanes in which it ends and how many legs
-    they have flown before; with the slopes of the guards if these are asked for.
+    Each turn is handed to `log(logged, before, after, leg)`: the leg has ended in the lanes that have more legs after it.
     """
     start = start_progress(scene, surfaces, dt, active)
 
@@ -133,8 +123,8 @@ def find_events(
 
     def advance(carry: tuple[Progress, Tree]) -> tuple[Progress, Tree]:
         before, logged = carry
-        after, leg = _advance(motion, scene, surfaces, t, dt, before, slopes)
-        return after, log(logged, after.legs > before.legs, before.legs, leg)
+        after, leg = _advance(motion, scene, surfaces, t, dt, before)
+        return after, log(logged, before, after, leg)
 
     return bounded_while_loop(going, advance, (start, logged), most=MAX_TRIES * (MAX_IMPACTS + 1))
 
@@ -144,7 +134,7 @@ def _is_under_way(progress: Progress) -> Array:
 
 
 def _advance(
-    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, now: Progress, slopes: bool
+    motion: Motion, scene: Scene, surfaces: Surfaces, t: Time, dt: Array, now: Progress
 ) -> tuple[Progress, Leg]:
     """A turn of every lane that is under way: it moves once, for the duration that it proposes."""
     going, refining = _is_under_way(now), now.bracket.refining & _is_under_way(now)
@@ -178,13 +168,7 @@ def _advance(
         return _refine(held, faces, refining, leg_start, duration, end, dt, at_end)
 
     after, verdict = lax.cond(any_lane(refining), refine, lambda: quiet)
-    slope = jnp.zeros_like(dt)
-    if slopes:
-        found = verdict.bounces | verdict.stops
-        slope = materialise_where(
-            found, lambda: _measure_slope(motion, held, faces, leg_start, duration, verdict.guard)
-        )
-    return after, Leg(duration, mode, verdict, arrives, slope)
+    return after, Leg(duration, mode, verdict, arrives)
 
 
 def _begin_leg(
@@ -201,18 +185,6 @@ def _begin_leg(
 
     mode, put = materialise_where(touches, decide, (make_free_mode(scene, faces), now.state))
     return choose_mode(tries, mode, now.mode), choose_lanes(tries, put, now.state)
-
-
-def _measure_slope(
-    motion: Motion, held: Scene, faces: Surfaces, leg_start: Time, duration: Array, guard: Array
-) -> Array:
-    """The derivative of a guard by the duration of the leg [1/s], along the method's own step."""
-
-    def follow(duration: Array) -> Array:
-        end = motion(held, leg_start, duration).state
-        return select_guard(measure_guards(faces, get_reaction(held), to_float_time(leg_start + duration), end), guard)
-
-    return jax.jvp(follow, (duration,), (jnp.ones_like(duration),))[1]
 
 
 def _begin_bracket(

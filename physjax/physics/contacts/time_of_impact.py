@@ -28,10 +28,19 @@ from physjax.physics.contacts.legs import (
     has_moved_over,
     invalidate_lanes,
 )
-from physjax.physics.contacts.replay import log_events, replay_step
-from physjax.physics.contacts.search import Leg, Progress, find_events
+from physjax.physics.contacts.replay import (
+    FlownLeg,
+    HeldLeg,
+    LegStart,
+    end_leg,
+    fly_leg,
+    fold_legs,
+    hold_leg,
+    log_events,
+)
+from physjax.physics.contacts.search import Progress, find_events
 from physjax.physics.contacts.surfaces import Surfaces
-from physjax.replays import differentiate_by_replay, hoist_closures
+from physjax.replays import Record, Replay, differentiate_by_replay, hoist_closures
 from physjax.scene import Scene, trace_once
 from physjax.vectors import scale
 
@@ -112,8 +121,8 @@ def _step_through_contacts(
     """The step, leg by leg from impact to impact, of lanes that may meet something; the others have arrived."""
     passage = _Passage(motion, changing, meets, scene, _collect_surfaces(scene), t, dt)
     if holds_user_code((motion, scene)):
-        return hoist_closures(_call_functions, _find_end, _log_end, _replay_end, passage)
-    return differentiate_by_replay(_find_end, _log_end, _replay_end, passage)
+        return hoist_closures(_call_functions, _find_end, _log_end, _REPLAY, passage)
+    return differentiate_by_replay(_find_end, _log_end, _REPLAY, passage)
 
 
 def _call_functions(passage: _Passage) -> PyTree:
@@ -129,22 +138,43 @@ def _find_end(passage: _Passage) -> tuple[Particles, Array]:
     return _finish(passage, progress)
 
 
-def _log_end(passage: _Passage) -> tuple[tuple[Particles, Array], tuple[Array, Leg]]:
+def _log_end(passage: _Passage) -> tuple[tuple[Particles, Array], Record]:
     """The same, and a record for the replay."""
     motion, _, meets, scene, surfaces, t, dt = passage
-    progress, legs = log_events(motion, scene, surfaces, t, dt, meets, MAX_DIFFERENTIATED_IMPACTS)
-    return _finish(passage, progress), (progress.legs, legs)
+    progress, record = log_events(motion, scene, surfaces, t, dt, meets, MAX_DIFFERENTIATED_IMPACTS)
+    return _finish(passage, progress), record
 
 
-def _replay_end(flown: tuple[Array, Leg], passage: _Passage) -> tuple[Particles, Array]:
-    """The same by a replay, differentiable."""
-    motion, changing, meets, scene, surfaces, t, dt = passage
-    state, since, _ = replay_step(motion, scene, surfaces, t, dt, flown, lambda nothing, _: nothing, ())
+def _begin_replay(passage: _Passage) -> LegStart:
+    """Where the first leg begins; lanes that meet nothing have arrived."""
+    _, (state, since), meets, scene, surfaces, _, dt = passage
+    since = jnp.where(meets[None], surfaces.touching_since, since)
+    return LegStart(jnp.zeros_like(dt), choose_lanes(meets, scene.state, state), since)
+
+
+def _hold_leg(choices: FlownLeg, start: LegStart, passage: _Passage) -> HeldLeg:
+    motion, _, _, scene, surfaces, t, dt = passage
+    return hold_leg(choices, start, motion, scene, surfaces, t, dt)
+
+
+def _fly_leg(choices: FlownLeg, leg: HeldLeg, duration: Array, passage: _Passage) -> tuple[Particles, Array]:
+    return fly_leg(choices, leg, duration, passage.motion)
+
+
+def _end_leg(choices: FlownLeg, leg: HeldLeg, duration: Array, end: Particles, passage: _Passage) -> LegStart:
+    del passage
+    return end_leg(choices, leg, duration, end)
+
+
+def _finish_replay(record: Record, end: LegStart) -> tuple[Particles, Array]:
+    """State and begin of contact after the last leg: NaN where not all of the legs were logged."""
+    lost = record.active[-1] & ~record.choices.arrives[-1]
     # a product: a NaN that is chosen has derivative zero
-    known = jnp.where(flown[0] > MAX_DIFFERENTIATED_IMPACTS + 1, jnp.nan, jnp.ones_like(dt))
-    state = jax.tree.map(lambda leaf: scale(known, leaf), state)
-    since = jnp.where(meets[None], since, changing[1])
-    return choose_lanes(meets, state, changing[0]), since
+    known = jnp.where(lost, jnp.nan, jnp.ones_like(end.elapsed))
+    return jax.tree.map(lambda leaf: scale(known, leaf), end.state), end.since
+
+
+_REPLAY = Replay(_begin_replay, _hold_leg, _fly_leg, _end_leg, _finish_replay)
 
 
 def _finish(passage: _Passage, progress: Progress) -> tuple[Particles, Array]:
@@ -169,10 +199,8 @@ def fold_flights(
     """The total of `total = add(total, flight)` over the legs of the step that `impact` takes, and the state after it."""
     surfaces, dt = _collect_surfaces(scene), jnp.broadcast_to(dt, scene.state.lanes)
     active = jnp.ones(dt.shape, bool)
-    progress, legs = log_events(motion, scene, surfaces, t, dt, active, MAX_IMPACTS)
-    flown = progress.legs, legs
-    *_, total = replay_step(motion, scene, surfaces, t, dt, flown, add, total)
-    return total, progress.state
+    progress, record = log_events(motion, scene, surfaces, t, dt, active, MAX_IMPACTS)
+    return fold_legs(motion, scene, surfaces, t, dt, record, add, total), progress.state
 
 
 def _collect_surfaces(scene: Scene) -> Surfaces:

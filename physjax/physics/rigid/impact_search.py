@@ -54,6 +54,15 @@ class Progress(NamedTuple):
     arrived: Bool[Array, "*lanes"]
 
 
+class LegLog(NamedTuple):
+    """How legs began and how long they took [s], along a first axis, and which of them ended with an impact."""
+
+    leg: Leg
+    elapsed: Array
+    duration: Array
+    strikes: Bool[Array, "legs *lanes"]
+
+
 class _Search(NamedTuple):
     """What a turn hands to the next, of each body: its leg, when that began [s], and what the body is about to do."""
 
@@ -66,7 +75,7 @@ class _Search(NamedTuple):
     arrived: Bool[Array, "*lanes"]
     impacts: Int[Array, "*lanes"]
     bracket: Bracket
-    durations: Array | None
+    log: LegLog | None
 
 
 def split_remaining_step(elapsed: Array, t: Time, dt: Array) -> tuple[Time, Array]:
@@ -83,17 +92,21 @@ def start_progress(scene: Scene, dt: ArrayLike) -> tuple[Progress, Array]:
 
 def find_impacts(
     motion: Motion, scene: Scene, kinds: tuple[ContactKind, ...], t: Time, dt: ArrayLike, *, logged: bool = False
-) -> tuple[Progress, Array | None]:
-    """Where the bodies are at the end of a step, and, `logged`, the durations [s] of the legs of each that end in an impact.
+) -> tuple[Progress, Array, LegLog | None]:
+    """Where the bodies are at the end of a step, how many legs took them there, and, `logged`, these.
 
-    Durations are `(legs, *lanes)`, infinite for a leg that reaches the end of the step. Nothing here has derivatives.
+    Nothing here has derivatives.
     """
     progress, dt = start_progress(scene, dt)
     scene = scene.replace(state=progress.state)
     points, zero, no = count_points(kinds), jnp.zeros_like(dt), jnp.zeros(dt.shape, bool)
     nowhere = jnp.zeros((points, *scene.state.position.shape), scene.state.dtype)
+    leg, log = start_leg(scene.state, points), None
+    if logged:
+        blank = LegLog(leg, zero, dt, no)
+        log = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (MAX_LEGS, *leaf.shape)), blank)
     start = _Search(
-        leg=start_leg(scene.state, points),
+        leg=leg,
         center=Particles(nowhere, nowhere),
         elapsed=zero,
         begins=~no,
@@ -102,7 +115,7 @@ def find_impacts(
         arrived=progress.arrived,
         impacts=jnp.zeros(dt.shape, jnp.int32),
         bracket=Bracket(zero, zero, zero, zero, zero),
-        durations=jnp.full((MAX_LEGS, *dt.shape), jnp.inf, dt.dtype) if logged else None,
+        log=log,
     )
     end = bounded_while_loop(
         lambda search: any_lane(_goes_on(search)),
@@ -110,7 +123,9 @@ def find_impacts(
         start,
         most=MAX_LEGS * MAX_TURNS_PER_LEG,
     )
-    return Progress(end.elapsed, end.leg.before, end.arrived), end.durations
+    # the last leg of those that arrived, and did not before they began
+    legs = end.impacts + (end.arrived & ~progress.arrived).astype(jnp.int32)
+    return Progress(end.elapsed, end.leg.before, end.arrived), legs, end.log
 
 
 def _goes_on(search: _Search) -> Array:
@@ -152,11 +167,11 @@ def _take_turn(
     narrower = narrower._replace(share=jnp.where(is_root, 0.0, narrower.share))
     bracket = choose_lanes(hit, bracket, choose_lanes(seeks & ~search.found, narrower, search.bracket))
     before = choose_lanes(stage.strikes, met.struck, choose_lanes(ends, met.held, leg.before))
-    durations = search.durations
-    if durations is not None:
+    log = search.log
+    if log is not None:
         numbers = jnp.arange(MAX_LEGS, dtype=jnp.int32).reshape(-1, *(1,) * dt.ndim)
-        slot = (numbers == search.impacts[None]) & stage.strikes[None]
-        durations = jnp.where(slot, h[None], durations)
+        slot = (numbers == search.impacts[None]) & (stage.strikes | ends)[None]
+        log = _write_leg(log, slot, LegLog(met.leg, search.elapsed, h, stage.strikes))
     return _Search(
         leg=met.leg._replace(before=before),
         center=center,
@@ -167,8 +182,18 @@ def _take_turn(
         arrived=search.arrived | ends,
         impacts=search.impacts + stage.strikes.astype(jnp.int32),
         bracket=bracket,
-        durations=durations,
+        log=log,
     )
+
+
+def _write_leg(log: LegLog, slot: Array, leg: LegLog) -> LegLog:
+    """The log with a leg written into the slots, of some legs and bodies, that are flagged."""
+    new = jax.tree.map(lambda leaf: leaf[None], leg)
+    # `on` has an axis of points between those of legs and bodies
+    flags = lambda logged: logged._replace(leg=logged.leg._replace(on=slot))  # noqa: E731
+    written = choose_lanes(slot, flags(new), flags(log))
+    on = jnp.where(slot[:, None], new.leg.on, log.leg.on)
+    return written._replace(leg=written.leg._replace(on=on))
 
 
 def _bracket_impact(

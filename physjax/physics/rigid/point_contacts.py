@@ -5,6 +5,7 @@ moves a body in it, and slower than a share of the speed that it gives, would no
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -70,6 +71,10 @@ class PointContact(Contact):
         """The points of the hull at the surface, of bodies with these velocities v and ω."""
 
     @abstractmethod
+    def measure_points(self, t: ArrayLike, state: RigidBodies) -> Float[Array, "points *lanes"]:
+        """Signed distance of each point of the hull to the surface [m]."""
+
+    @abstractmethod
     def walls(self) -> tuple["PointContact", ...]:
         """A contact with each of the surfaces that its surface consists of."""
 
@@ -125,8 +130,7 @@ def gather_point_states(
 
     What only some surfaces have, curvature or friction, is zero at the others.
     """
-    locate = lambda contact: contact.point_state(to_float_time(t), state, velocities)  # noqa: E731
-    parts = [locate(kind.part) if kind.size == 1 else _join_contacts(kind.map(locate)) for kind in kinds]
+    parts = _map_points(kinds, lambda contact: contact.point_state(to_float_time(t), state, velocities))
     if len(parts) == 1:
         return parts[0]
     if any(part.turning is not None for part in parts):
@@ -137,6 +141,16 @@ def gather_point_states(
         rough = [part.points._replace(friction=part.points.friction or zero(part)) for part in parts]
         parts = [part._replace(points=points) for part, points in zip(parts, rough, strict=True)]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+def measure_points(kinds: tuple[ContactKind, ...], t: Time, state: RigidBodies) -> Float[Array, "points *lanes"]:
+    """The signed distance of every point of every hull to its surface [m]."""
+    return jnp.concatenate(_map_points(kinds, lambda contact: contact.measure_points(to_float_time(t), state)))
+
+
+def _map_points(kinds: tuple[ContactKind, ...], function: Callable[[PointContact], T]) -> list[T]:
+    """What a function makes of the points of each kind of contacts, all of a kind along one axis."""
+    return [function(kind.part) if kind.size == 1 else _join_contacts(kind.map(function)) for kind in kinds]
 
 
 def _join_contacts(tree: T) -> T:

@@ -1,161 +1,154 @@
 """The step of rigid bodies flown again with its impacts known, which is what its derivatives go through.
 
-The search finds without derivatives when bodies strike. With these times the step is a short scan over its legs. The moment
-of an impact is h - d(h)/s, with d the distance of the lowest point on the method's own step, and s its derivative by h, which
-is held: the value is only rounded again, but it moves with all that d depends on. By differences s is off by a share ε, and
-the derivatives by ε²: the second pass corrects the first.
+A leg has two halves, in which impulses act: as it begins, and as it ends. The search finds without derivatives when bodies
+strike; the moment of an impact moves along the zero of the distance of the lowest point.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from physjax.backend import any_lane
 from physjax.loops import Time
 from physjax.physics.contacts.legs import Flight, Motion, choose_lanes
-from physjax.physics.rigid.impact_search import MAX_LEGS, Progress, split_remaining_step, start_progress
-from physjax.physics.rigid.point_contacts import ContactKind, count_points, face_surfaces
+from physjax.physics.rigid.impact_search import MAX_LEGS, LegLog, split_remaining_step
+from physjax.physics.rigid.point_contacts import ContactKind, face_surfaces, measure_points, stack_body_contacts
 from physjax.physics.rigid.reactions import (
     Leg,
     Place,
     Stage,
+    Thrust,
     apply_half_impulse,
     exchange_impulses,
     move_with_reactions,
-    start_leg,
     take_shared_number,
 )
+from physjax.physics.rigid.spatial import RigidBodies
+from physjax.replays import Record, Replay
 from physjax.scene import Scene
 
-NEWTON_PASSES = 2
-"""Newton steps for the moment of an impact: each gives one more order of its derivatives."""
-
 Total = TypeVar("Total")
-Observer = Callable[[Total, Flight], Total]
 
 
-class _Replay(NamedTuple):
-    """What one half of a leg hands to the next."""
+class HalfStart(NamedTuple):
+    """Where half a leg begins: time since the step's start [s], the bodies as the leg began, and the reactions through it."""
 
-    leg: Leg
     elapsed: Array
-    arrived: Array
+    before: RigidBodies
+    thrust: Thrust
 
 
-def replay_step(
+class HalfLeg(NamedTuple):
+    """What is decided of half a leg, without derivatives: which points stay, which bodies are at rest, what they measure.
+
+    `ends` says for all bodies which half it is. Those that are `active` have this leg.
+    """
+
+    on: Bool[Array, "points *lanes"]
+    rests: Bool[Array, "*lanes"]
+    load_speed: Array
+    ends: Bool[Array, ""]
+    strikes: Bool[Array, "*lanes"]
+    active: Bool[Array, "*lanes"]
+
+
+class HeldLeg(NamedTuple):
+    """A leg: time before it [s], how it began, the surfaces that it meets, when it began [s], what was left of the step [s]."""
+
+    elapsed: Array
+    leg: Leg
+    facing: tuple[ContactKind, ...]
+    leg_start: Time
+    rest: Array
+
+
+def record_legs(log: LegLog, legs: Array) -> Record:
+    """What a replay needs of the legs that a search has logged, of which each body has this number."""
+    numbers = jnp.arange(2 * MAX_LEGS, dtype=jnp.int32)
+    by_half = lambda number: number.reshape(-1, *(1,) * legs.ndim)  # noqa: E731
+    (leg, elapsed, duration, strikes) = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), log)
+    ends, active = numbers % 2 == 1, by_half(numbers // 2) < legs[None]
+    choices = HalfLeg(leg.on, leg.rests, leg.load_speed, ends, strikes & by_half(ends), active)
+    return Record(HalfStart(elapsed, leg.before, leg.thrust), jnp.where(by_half(ends), duration, 0.0), choices, active)
+
+
+def _begin(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> HalfStart:
+    state, none = scene.state, jnp.zeros_like(scene.state.momentum)
+    return HalfStart(jnp.zeros(state.lanes, state.dtype), state, (none, none))
+
+
+def _hold(choices: HalfLeg, start: HalfStart, motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> HeldLeg:
+    elapsed, before, thrust = start
+    leg_start, rest = split_remaining_step(elapsed, t, jnp.broadcast_to(dt, elapsed.shape))
+    facing = face_surfaces(stack_body_contacts(scene), leg_start, before)
+    leg = Leg(before, thrust, choices.on, choices.rests, choices.load_speed)
+    return HeldLeg(elapsed, leg, facing, leg_start, rest)
+
+
+def _fly(
+    choices: HalfLeg, held: HeldLeg, duration: Array, motion: Motion, scene: Scene, t: Time, dt: ArrayLike
+) -> tuple[RigidBodies, Array]:
+    """The bodies after a duration [s]; and the distance of the lowest point that does not rest [m], or the rest of the step."""
+    move = lambda: move_with_reactions(motion, scene, held.leg, held.leg_start, duration)  # noqa: E731
+    end = lax.cond(choices.ends, move, lambda: held.leg.before)
+    distance = measure_points(held.facing, held.leg_start + duration, end)
+    lowest = jnp.min(jnp.where(choices.on, jnp.inf, distance), axis=0)
+    left = jnp.where(choices.ends, held.rest, 0.0) - duration
+    return end, jnp.where(choices.strikes, lowest, left)
+
+
+def _end(
+    choices: HalfLeg,
+    held: HeldLeg,
+    duration: Array,
+    end: RigidBodies,
     motion: Motion,
     scene: Scene,
-    kinds: tuple[ContactKind, ...],
-    durations: Array,
     t: Time,
     dt: ArrayLike,
-    observe: tuple[Observer, Total] | None = None,
-) -> tuple[Progress, Total | None]:
-    """The step with these durations of the legs that end in an impact [s], and what an observer made of its flights.
-
-    `durations` are `(legs, *lanes)` and infinite where a leg reaches the end of the step.
-    """
-    progress, dt = start_progress(scene, dt)
-    add, total = (None, None) if observe is None else observe
-
-    # reverse mode computes each half of a leg again: storing what it needs of one costs more than the work
-    @jax.checkpoint
-    def act(replay: _Replay, total: Total, duration: Array, ends: Array) -> tuple[_Replay, Total]:
-        return _take_half_leg(motion, scene, kinds, replay, (duration, ends), t, dt, add, total)
-
-    def go_on(carry: tuple[_Replay, Any], half: tuple[Array, Array]) -> tuple[tuple[_Replay, Any], None]:
-        return lax.cond(
-            any_lane(~carry[0].arrived), act, lambda replay, total, *_: (replay, total), *carry, *half
-        ), None
-
-    # a leg has two halves, in which impulses act: as it begins, and as it ends
-    halves = jnp.repeat(durations, 2, axis=0), jnp.arange(2 * MAX_LEGS) % 2 == 1
-    start: tuple[_Replay, Any] = (
-        _Replay(start_leg(scene.state, count_points(kinds)), progress.elapsed, progress.arrived),
-        total,
-    )
-    (end, total), _ = lax.scan(go_on, start, halves)
-    return Progress(end.elapsed, end.leg.before, end.arrived), total
+) -> HalfStart:
+    """The start of the next half: after the reactions have begun, or after an impact."""
+    active, strikes, leg = choices.active, choices.strikes, held.leg
+    here = Place.find(held.facing, held.leg_start + duration, end, scene.mass)
+    stage = Stage(active & ~choices.ends, active & choices.ends & ~strikes, active & strikes)
+    dt = jnp.broadcast_to(dt, held.rest.shape)
+    met = exchange_impulses(scene, leg, stage, here, (dt, held.rest))
+    after = choose_lanes(stage.strikes, met.struck, choose_lanes(stage.arrives, met.held, leg.before))
+    return HalfStart(jnp.where(active, held.elapsed + duration, held.elapsed), after, met.leg.thrust)
 
 
-def _take_half_leg(
+REPLAY = Replay(_begin, _hold, _fly, _end, lambda record, end: end.before)
+"""A step of rigid bodies, half a leg at a time."""
+
+
+def fold_legs(
     motion: Motion,
     scene: Scene,
-    kinds: tuple[ContactKind, ...],
-    replay: _Replay,
-    half: tuple[Array, Array],
     t: Time,
-    dt: Array,
-    add: Observer | None,
+    dt: ArrayLike,
+    record: Record,
+    add: Callable[[Total, Flight], Total],
     total: Total,
-) -> tuple[_Replay, Total]:
-    """The beginning of a leg, with its reactions, or its flight and what it `ends` with: an impact, or the end of the step."""
-    leg, (duration, ends) = replay.leg, half
-    leg_start, rest = split_remaining_step(replay.elapsed, t, dt)
-    facing = face_surfaces(kinds, leg_start, leg.before)
-    going = ~replay.arrived
-    strikes = going & ends & jnp.isfinite(duration)
-    h = jnp.where(ends, jnp.where(strikes, duration, rest), 0.0)
-    fly = partial(_fly_leg, motion, scene, facing, leg, leg_start)
-    h, here = _find_moment(fly, h, strikes, ends)
-    stage = Stage(going & ~ends, going & ends & ~strikes, strikes)
-    met = exchange_impulses(scene, leg, stage, here, (dt, rest))
-    after = choose_lanes(strikes, met.struck, choose_lanes(stage.arrives, met.held, leg.before))
-    if add is not None:
+) -> Total:
+    """The total of `total = add(total, flight)` over the legs of a step."""
+    shared = partial(take_shared_number, scene)
+
+    def fly(total: Total, half: Record) -> Total:
+        choices, h = half.choices, half.durations
+        held = _hold(choices, half.starts, motion, scene, t, dt)
+        leg = held.leg
+        end, _ = _fly(choices, held, h, motion, scene, t, dt)
+        after = _end(choices, held, h, end, motion, scene, t, dt).before
         start = scene.replace(state=apply_half_impulse(leg.before, leg.thrust, h))
-        shared = partial(take_shared_number, scene)
-        flight = Flight(leg.before, start, shared(leg_start), shared(h), here.state, after, going)
-        total = lax.cond(ends, lambda: add(total, flight), lambda: total)
-    elapsed = replay.elapsed + jnp.where(going, h, 0.0)
-    return _Replay(met.leg._replace(before=after), elapsed, replay.arrived | stage.arrives), total
+        return add(total, Flight(leg.before, start, shared(held.leg_start), shared(h), end, after, half.active))
 
+    def go_on(total: Total, half: Record) -> tuple[Total, None]:
+        return lax.cond(half.choices.ends & any_lane(half.active), lambda: fly(total, half), lambda: total), None
 
-def _fly_leg(
-    motion: Motion,
-    scene: Scene,
-    kinds: tuple[ContactKind, ...],
-    leg: Leg,
-    leg_start: Time,
-    ends: Array,
-    h: Array,
-) -> tuple[Array, Place]:
-    """The distance of the lowest point that does not rest [m] after a time h [s], and where the bodies are then."""
-    state = lax.cond(ends, lambda h: move_with_reactions(motion, scene, leg, leg_start, h), lambda _: leg.before, h)
-    there = Place.find(kinds, leg_start + h, state, scene.mass)
-    return jnp.min(jnp.where(leg.on, jnp.inf, there.points.signed_distance), axis=0), there
-
-
-def _find_moment(fly: Callable, h: Array, strikes: Array, ends: Array) -> tuple[Array, Place]:
-    """The durations with their derivatives, and where the bodies are after them.
-
-    The first two of the loop's passes look a little before and after the moment, for the distance's derivative by h; the
-    next are Newton's. In one loop the motion stands once; without an impact its last pass is enough.
-    """
-    nowhere = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fly, ends, h))
-    offset = float(jnp.finfo(h.dtype).eps) ** (1 / 3) * h
-    passes = 2 + NEWTON_PASSES + 1
-
-    def pass_(carry: tuple, number: Array) -> tuple[tuple, None]:
-        def look(h: Array, slope: Array) -> tuple:
-            before, after = number == 0, number == 1
-            here = h + jnp.where(before, -offset, jnp.where(after, offset, 0.0))
-            distance, there = fly(ends, here)
-            # before the moment the distance itself is kept, after it the two make the derivative
-            measured = lax.stop_gradient(
-                jnp.where(before, distance, (distance - slope) / jnp.where(strikes, 2 * offset, 1.0))
-            )
-            falls = strikes & (slope < 0) & (number > 1) & (number < passes - 1)
-            h = jnp.where(falls, h - distance / jnp.where(falls, slope, 1.0), h)
-            return h, jnp.where(number < 2, measured, slope), (distance, there)
-
-        skip = lambda h, slope: (h, slope, carry[-1])  # noqa: E731
-        return lax.cond((number == passes - 1) | any_lane(strikes), look, skip, *carry[:-1]), None
-
-    (h, _, (_, there)), _ = lax.scan(pass_, (h, jnp.zeros_like(h), nowhere), jnp.arange(passes))
-    return h, there
+    return lax.scan(go_on, total, record)[0]

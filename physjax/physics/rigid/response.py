@@ -37,9 +37,9 @@ from physjax.physics.rigid.reactions import (
     start_leg,
     take_shared_number,
 )
-from physjax.physics.rigid.replay import replay_step
+from physjax.physics.rigid.replay import REPLAY, fold_legs, record_legs
 from physjax.physics.rigid.spatial import RigidBodies
-from physjax.replays import differentiate_by_replay, hoist_closures
+from physjax.replays import Record, differentiate_by_replay, hoist_closures
 from physjax.scene import Scene, trace_once
 from physjax.vectors import norm
 
@@ -67,8 +67,8 @@ def collide(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
         return scene.replace(state=_resolve_at_step_end(motion, scene, t, dt)[0])
     inputs = (motion, scene, t, dt)
     if holds_user_code((motion, scene)):
-        return scene.replace(state=hoist_closures(_call_functions, _find_end, _log_end, _replay_end, *inputs))
-    return scene.replace(state=differentiate_by_replay(_find_end, _log_end, _replay_end, *inputs))
+        return scene.replace(state=hoist_closures(_call_functions, _find_end, _log_end, REPLAY, *inputs))
+    return scene.replace(state=differentiate_by_replay(_find_end, _log_end, REPLAY, *inputs))
 
 
 def _call_functions(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> PyTree:
@@ -85,17 +85,12 @@ def _find_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> RigidBodi
     return _invalidate_overrun_lanes(kinds, find_impacts(motion, scene, kinds, t, dt)[0], t, dt)
 
 
-def _log_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[RigidBodies, Array | None]:
-    """The same, and the durations of the legs for the replay."""
+def _log_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[RigidBodies, Record]:
+    """The same, and a record for the replay."""
     kinds = stack_body_contacts(scene)
-    progress, durations = find_impacts(motion, scene, kinds, t, dt, logged=True)
-    return _invalidate_overrun_lanes(kinds, progress, t, dt), durations
-
-
-def _replay_end(durations: Array, motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> RigidBodies:
-    """The same by a replay with these durations, differentiable."""
-    kinds = stack_body_contacts(scene)
-    return replay_step(motion, scene, kinds, durations, t, dt)[0].state
+    progress, legs, log = find_impacts(motion, scene, kinds, t, dt, logged=True)
+    assert log is not None
+    return _invalidate_overrun_lanes(kinds, progress, t, dt), record_legs(log, legs)
 
 
 def fold_body_flights(
@@ -109,12 +104,8 @@ def fold_body_flights(
     if scene.couples:
         after, leg = _resolve_at_step_end(motion, scene, t, dt)
         return add(total, _build_whole_flight(motion, scene, leg, t, dt, after)), after
-    kinds = stack_body_contacts(scene)
-    _, durations = find_impacts(motion, scene, kinds, t, dt, logged=True)
-    assert durations is not None
-    progress, after = replay_step(motion, scene, kinds, durations, t, dt, (add, total))
-    assert after is not None
-    return after, _invalidate_overrun_lanes(kinds, progress, t, dt)
+    after, record = _log_end(motion, scene, t, dt)
+    return fold_legs(motion, scene, t, dt, record, add, total), after
 
 
 def _build_whole_flight(

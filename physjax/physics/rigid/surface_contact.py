@@ -134,10 +134,14 @@ class SurfaceContact(PointContact):
         share, depth = self.surface.deepest(t, dt, start, end, (dip[0], dip[1] + radius))
         return share, depth - radius
 
+    def measure_points(self, t: ArrayLike, state: RigidBodies) -> Float[Array, "points *lanes"]:
+        """Signed distance of each point of the hull to the surface [m]."""
+        where = state.position[None] + self.hull.arms(state)
+        return self.signed_distance(jnp.broadcast_to(t, where.shape[:-1]), where)
+
     def clearance(self, t: ArrayLike, state: RigidBodies) -> Float[Array, "*lanes"]:
         """Signed distance of each body's lowest point to the surface [m]."""
-        where, face = state.position[None] + self.hull.arms(state), self.facing(t, state)
-        return jnp.min(face.signed_distance(jnp.broadcast_to(t, where.shape[:-1]), where), axis=0)
+        return jnp.min(self.facing(t, state).measure_points(t, state), axis=0)
 
     def respond(self, t: ArrayLike, state: RigidBodies) -> RigidBodies:
         """The bodies on the wrong side moved out of the surface, their velocities unchanged."""
