@@ -90,9 +90,9 @@ GRADIENT = {
     "fall_with_drag": 403,
     "flag": 8519,
     "bouncing_ball": 2486,
-    "tumbling_box": 13404,
-    "ragdoll": 26848,
-    "car": 23516,
+    "tumbling_box": 10263,
+    "ragdoll": 20082,
+    "car": 20079,
 }
 """Operations of a value and its gradient by velocities."""
 
