@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
@@ -52,6 +53,12 @@ def holds_user_code(part: PyTree) -> bool:
         return True
     children = jax.tree.leaves(part, is_leaf=lambda node: node is not part)
     return any(holds_user_code(child) for child in children if child is not part)
+
+
+def is_untransformed(run: PyTree) -> bool:
+    """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
+    traced = any(isinstance(leaf, Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
+    return not traced and not holds_user_code(run)
 
 
 def _is_library_definition(definition: Any) -> bool:

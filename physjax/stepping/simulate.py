@@ -25,7 +25,7 @@ from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
 from physjax.components import compute_by_components, forget_wholes, join_vectors, split_vectors
 from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
-from physjax.parts import as_module, find_plain_functions, holds_user_code
+from physjax.parts import as_module, find_plain_functions, is_untransformed
 from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 from physjax.trajectory import Trajectory, select_stateful_parts
@@ -79,7 +79,7 @@ def simulate(
     method = as_module(method)
     warn_of_recompilation("simulate", (*(plain.function for plain in find_plain_functions((scene, method))), record))
     first_step, dt = _check_first_step(first_step, steps, dt)
-    alone = record is None and _is_untransformed((scene, method, dt, first_step))
+    alone = record is None and is_untransformed((scene, method, dt, first_step))
     run = _get_standalone_run(scene.compile_bound) if alone else _run_inside
     return run(scene, method, dt, first_step, steps // save_every, save_every, record)
 
@@ -172,12 +172,6 @@ _run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
 def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
     """The compiled run where no transformation is around it; made at the first run, since it asks for the device."""
     return jit_untransformed(_run_steps, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
-
-
-def _is_untransformed(run: tuple) -> bool:
-    """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
-    traced = any(isinstance(leaf, Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
-    return not traced and not holds_user_code(run[:2])
 
 
 def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:

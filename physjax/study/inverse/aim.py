@@ -7,6 +7,7 @@ aimed.low.angle, aimed.high.angle, aimed.low.time, aimed.ok
 ```
 """
 
+import functools
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,12 +19,13 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
+from physjax.backend import jit_untransformed
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none, demand_all
 from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
 from physjax.linear import solve_columns
 from physjax.particles import Particles, demand_particles
-from physjax.parts import as_module
+from physjax.parts import as_module, is_untransformed
 from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import Scene
 from physjax.stepping.methods import rk4
@@ -149,16 +151,27 @@ def aim_at(
                 f"speed [m/s]: got shape {speed.shape}, expected () or {shots.target.shape[:-1]}, one for each target."
             )
         speed = jnp.broadcast_to(speed, shots.target.shape[:-1])
-    return Aimed(*_solve_both_arcs(shots, speed, bounces), shots)
+    alone = shots.scene.compile_bound and is_untransformed((shots, speed))
+    solve = _get_standalone_solver() if alone else _solve_inside
+    low, high = solve(shots, speed, bounces)
+    return Aimed(low, high, shots)
 
 
-@eqx.filter_jit
 def _solve_both_arcs(shots: AimProblem, speed: Array | None, bounces: int) -> tuple[Shot, Shot]:
     if speed is None:
         shot = _solve_arc(shots, None, None, bounces)
         return shot, shot
     both = lax.map(lambda late: _solve_arc(shots, speed, late, bounces), jnp.array([False, True]))
     return tuple(jax.tree.map(lambda leaf, i=i: leaf[i], both) for i in (0, 1))
+
+
+_solve_inside = jax.jit(_solve_both_arcs, static_argnames=("bounces",))
+
+
+@functools.cache
+def _get_standalone_solver() -> Callable[..., tuple[Shot, Shot]]:
+    """The compiled search through contacts where no transformation is around it; made at the first, as it asks for the device."""
+    return jit_untransformed(_solve_both_arcs, many_small_kernels=True, static_argnames=("bounces",))
 
 
 def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounces: int) -> Shot:
