@@ -4,10 +4,11 @@ Each policy has its reason and its measurement next to it. CPU figures are of tw
 0.12, unless they say otherwise.
 
 - What is computed by components: `splits_vectors`.
-- What is computed once: `any_lane`, `materialise`, `materialise_where`, `block_fusion`.
+- What is computed once: `any_lane`, `materialise`, `materialise_where`, `block_fusion`, `evaluate_coupled`,
+  `store_on_any_device`, `SPRINGS_AT_BOTH_ENDS`.
 - How a loop is compiled: `split_compilation`, `bounded_while_loop`, `needs_split_compilation`.
 - Which lanes are computed: `compact_and_apply`, `compact_and_apply_runs`.
-- How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `SOURCES_PER_TILE`.
+- How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `choose_block_targets`, `choose_tile_sources`.
 - What the compiler is asked for: `jit_untransformed`.
 - What its programs depend on: `name_compiler_target`.
 - Which clock a search goes by, and how a device is called: `read_work_clock`, `device_kind`, `describe_device`.
@@ -31,6 +32,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, PyTree
 
+S = TypeVar("S")
+"""A tree of arrays that goes in."""
 T = TypeVar("T")
 """A tree of arrays that comes back with the same structure and shapes."""
 
@@ -51,10 +54,20 @@ MAX_CARRIED_BYTES = 64 * LANES_PER_BLOCK
 MAX_BATCH_LANES = 16 * LANES_PER_BLOCK
 """Lanes in a batch of a sweep at most: more gain nothing, and a batch is what a kill loses."""
 SOURCES_PER_TILE = 64
-"""Bodies whose attraction is summed at once: few enough for registers and caches, enough to hide the loop over tiles.
+"""Bodies whose attraction is summed at once on a CPU: few enough for registers and caches, enough to hide the loop over tiles."""
+PAIRS_PER_TILE = 2**19
+"""Pairs in a tile elsewhere, where a tile's are stored: 2 MB for each array of them in float32, in each of many scenes."""
+TARGETS_PER_BLOCK = 4096
+"""Bodies for which the attraction of all others is summed at once where that is one kernel: enough to fill a card.
 
-Memory stays linear in the number of bodies. (On a GPU the same sum without tiles runs two to four times as fast.)
+The memory of a block would be linear in the number of bodies even if its pairs were stored.
 """
+SUMS_OVER_LAST_AXIS = True
+"""Whether that sum is over the last axis of (targets, sources), or over the first of (sources, targets)."""
+SPRINGS_AT_BOTH_ENDS = True
+"""Whether a GPU computes each spring at both of its ends, in one kernel a step, or once, which stores it in between."""
+STORES_STATE = True
+"""Whether a GPU stores the state before each evaluation of coupled forces."""
 WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
 """XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster."""
 OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
@@ -163,13 +176,30 @@ def materialise(t: ArrayLike, function: Callable[[], T]) -> T:
 
 
 def block_fusion(tree: T) -> T:
-    """The arrays as they are; what computes them is not fused with what reads them.
+    """The arrays as they are; on a CPU what computes them is not fused with what reads them.
 
     For what each reader would otherwise compute again: a spring's tension for every component and both ends, the
     padded copy of a sheet for each of its shifted slices, the path of a prescribed node for all of its neighbours. The
-    flag of `materialise` takes 1.4 times as long without.
+    flag of `materialise` takes 1.4 times as long without. On a GPU every barrier is one more kernel in a step, and costs
+    more than it saves.
     """
+    return lax.optimization_barrier(tree) if on_cpu() else tree
+
+
+def store_on_any_device(tree: T) -> T:
+    """The arrays as they are, stored before anything reads them, on a GPU too: for what is gathered from there."""
     return lax.optimization_barrier(tree)
+
+
+def evaluate_coupled(t: ArrayLike, function: Callable[[S], T], state: S) -> T:
+    """`function(state)` of coupled nodes, of which each reads the state of its neighbours, at any finite time t.
+
+    Without a store between two evaluations a neighbour's stages would be computed again by all that read it. On a CPU
+    what is found is stored, on a GPU what is read: the state, of which the first of a step is in memory already.
+    """
+    if on_cpu():
+        return materialise(t, lambda: function(state))
+    return function(store_on_any_device(state) if STORES_STATE else state)
 
 
 # how a loop is compiled
@@ -333,6 +363,20 @@ def choose_block_lanes(device: Device, carried_bytes: int) -> int:
     A CPU is fastest in its cache, anything else with all that it can hold.
     """
     return min(MAX_CARRIED_BYTES // carried_bytes, LANES_PER_BLOCK) if device.platform == "cpu" else MAX_BATCH_LANES
+
+
+def choose_block_targets(bodies: int) -> int | None:
+    """For how many of so many bodies the attraction of all is summed at once; None: it is folded over tiles of sources.
+
+    On a CPU the pairs of a tile stay in a cache. A GPU is faster with one reduction over all sources, whose pairs are
+    not stored: G pairs/s in blocks of sources 24, 82 and 184, in one 86, 350 and 363 (4096, 16 384, 65 536 bodies, H200).
+    """
+    return None if on_cpu() else min(bodies, TARGETS_PER_BLOCK)
+
+
+def choose_tile_sources(bodies: int) -> int:
+    """How many sources are in a tile of a sum that is folded over tiles."""
+    return SOURCES_PER_TILE if on_cpu() else max(SOURCES_PER_TILE, PAIRS_PER_TILE // bodies)
 
 
 # what the compiler is asked for

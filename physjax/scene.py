@@ -18,7 +18,7 @@ from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.backend import MIN_LANES_TO_SELECT, materialise, needs_split_compilation
+from physjax.backend import MIN_LANES_TO_SELECT, evaluate_coupled, needs_split_compilation
 from physjax.loops import (
     RECORD,
     Time,
@@ -224,8 +224,8 @@ class Scene(eqx.Module):
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.compiles_in_pieces:
             return state.rate(state.generalised_force(self, t), self.mass)
-        # materialised, or XLA would recompute a stage in every neighbour that reads it
-        return state.rate(materialise(to_float_time(t), lambda: state.generalised_force(self, t)), self.mass)
+        force = evaluate_coupled(to_float_time(t), lambda state: state.generalised_force(self, t), state)
+        return state.rate(force, self.mass)
 
     def kick(self, state: PyTree, rate: PyTree, dt: ArrayLike) -> PyTree:
         """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""

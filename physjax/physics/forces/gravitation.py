@@ -1,20 +1,27 @@
-"""Newtonian gravitation between all pairs, in tiles of sources: memory stays linear in the number of bodies."""
+"""Newtonian gravitation between all pairs, in blocks: memory stays linear in the number of bodies.
+
+On a CPU the sums are folded over tiles of sources. Elsewhere a block of targets sums over all sources at once, which is
+one reduction; its derivatives are those of the fold.
+"""
 
 from collections.abc import Callable
-from typing import ClassVar, TypeVar
+from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import SOURCES_PER_TILE
+from physjax.backend import SUMS_OVER_LAST_AXIS, choose_block_targets, choose_tile_sources
 from physjax.checks import Numbers, OptionalNumbers, quantity
 from physjax.particles import Particles
 from physjax.parts import Field
 
-Total = TypeVar("Total")
+Term = Callable[[list[Array], Array, Array | None], list[Array]]
+"""What pairs contribute to their targets, from their offsets [m], the strength GM of their sources and the softening [m]."""
 
 
 class Gravitation(Field):
@@ -39,27 +46,12 @@ class Gravitation(Field):
         self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]
     ) -> Float[Array, "*scenes nodes dim"]:
         """Σ_j G m_j (x_j - x_i)/d³ [m/s²]."""
-        x, gm = state.position, self._gm(state, mass)
-        targets = _split_components(x)
-
-        def pull(total: list[Array], sources: list[Array], strength: Array) -> list[Array]:
-            offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
-            near = self._inverse_distance(offsets)
-            weight = strength[..., None, :] * near * near * near  # in this order float32 reaches Pluto in SI units
-            return [a + jnp.sum(weight * d, axis=-1) for a, d in zip(total, offsets, strict=True)]
-
-        return jnp.stack(_fold_tiles(pull, [jnp.zeros_like(c) for c in targets], targets, gm), axis=-1)
+        return jnp.stack(_sum_over_sources(_pull, state.position, self._gm(state, mass), self.softening), axis=-1)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
         """-½ Σ_j m_i G m_j/d [J]: each pair's energy is halved between its two bodies."""
-        x, gm = state.position, self._gm(state, mass)
-        targets = _split_components(x)
-
-        def add(total: Array, sources: list[Array], strength: Array) -> Array:
-            offsets = [s[..., None, :] - x_i[..., :, None] for s, x_i in zip(sources, targets, strict=True)]
-            return total + jnp.sum(strength[..., None, :] * self._inverse_distance(offsets), axis=-1)
-
-        return -0.5 * mass * _fold_tiles(add, jnp.zeros_like(gm), targets, gm)
+        (total,) = _sum_over_sources(_weigh, state.position, self._gm(state, mass), self.softening)
+        return -0.5 * mass * total
 
     def _gm(self, state: Particles, mass: Array) -> Array:
         """GM of every body as a source [m³/s²]."""
@@ -69,38 +61,103 @@ class Gravitation(Field):
             )
         return jnp.broadcast_to(self.G * mass if self.gm is None else self.gm, state.lanes)
 
-    def _inverse_distance(self, offsets: list[Array]) -> Array:
-        """1/d, and zero between a body and itself (or another at the same point)."""
-        square = sum(d * d for d in offsets[1:]) + offsets[0] * offsets[0]
-        apart = square > 0
-        square = jnp.where(apart, square, 1.0)
-        if self.softening is not None:
-            square = square + self.softening * self.softening
-        # not rsqrt: its derivative contains d³, which leaves the range of float32 in SI units
-        return jnp.where(apart, 1.0 / jnp.sqrt(square), 0.0)
+
+def _pull(offsets: list[Array], strength: Array, softening: Array | None) -> list[Array]:
+    """G m_j (x_j - x_i)/d³ by components [m/s²]."""
+    near = _inverse_distance(offsets, softening)
+    weight = strength * near * near * near  # in this order float32 reaches Pluto in SI units
+    return [weight * d for d in offsets]
 
 
-def _split_components(x: Array) -> list[Array]:
-    """The components of positions, one array each: `(*scenes, nodes)` [m]."""
-    return [x[..., i] for i in range(x.shape[-1])]
+def _weigh(offsets: list[Array], strength: Array, softening: Array | None) -> list[Array]:
+    """G m_j/d [m²/s²]."""
+    return [strength * _inverse_distance(offsets, softening)]
 
 
-def _fold_tiles(
-    add: Callable[[Total, list[Array], Array], Total], total: Total, sources: list[Array], strength: Array
-) -> Total:
-    """Fold `add(total, sources, strength)` over tiles of sources; the last tile is padded with sources of zero strength."""
+def _inverse_distance(offsets: list[Array], softening: Array | None) -> Array:
+    """1/d, and zero between a body and itself (or another at the same point)."""
+    square = sum(d * d for d in offsets[1:]) + offsets[0] * offsets[0]
+    apart = square > 0
+    square = jnp.where(apart, square, 1.0)
+    if softening is not None:
+        square = square + softening * softening
+    # not rsqrt: its derivative contains d³, which leaves the range of float32 in SI units
+    return jnp.where(apart, 1.0 / jnp.sqrt(square), 0.0)
+
+
+def _sum_over_sources(term: Term, x: Array, strength: Array, softening: Array | None) -> list[Array]:
+    """The sum of a term over all sources for every body, `(*scenes, nodes)` each."""
+    bodies = [x[..., i] for i in range(x.shape[-1])]
+    if choose_block_targets(strength.shape[-1]) is None:
+        return _fold_tiles(term, bodies, strength, softening)
+    return _sum_blocks(term, bodies, strength, softening)
+
+
+def _sum_pairs(
+    term: Term, targets: list[Array], sources: list[Array], strength: Array, softening: Array | None, axis: int = -1
+) -> list[Array]:
+    """The sum of a term over some sources for some targets; `axis` is that of the sources, the last or the one before."""
+    other = -3 - axis
+    offsets = [jnp.expand_dims(s, other) - jnp.expand_dims(x, axis) for s, x in zip(sources, targets, strict=True)]
+    return [jnp.sum(part, axis=axis) for part in term(offsets, jnp.expand_dims(strength, other), softening)]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _sum_blocks(term: Term, bodies: list[Array], strength: Array, softening: Array | None) -> list[Array]:
+    """The sum over all sources at once, for one block of targets after the other.
+
+    A compiler that fuses stores none of a block's pairs. One reduction cannot go over sources and targets both, as a
+    gradient does, so derivatives are of the sum by tiles, whose pairs may be stored.
+    """
     count = strength.shape[-1]
-    if count <= SOURCES_PER_TILE:
-        return add(total, sources, strength)
-    missing = -count % SOURCES_PER_TILE
+    sums = lambda targets: _sum_pairs(  # noqa: E731
+        term, targets, bodies, strength, softening, -1 if SUMS_OVER_LAST_AXIS else -2
+    )
+    blocks = -(-count // (choose_block_targets(count) or count))
+    if blocks == 1:
+        return sums(bodies)
+    found = lax.map(sums, [_cut(x, blocks) for x in bodies])
+    return [jnp.moveaxis(a, 0, -2).reshape((*strength.shape[:-1], -1))[..., :count] for a in found]
 
-    def tiles(a: Array) -> Array:
-        filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, missing)])
-        return jnp.moveaxis(filled.reshape((*a.shape[:-1], -1, SOURCES_PER_TILE)), -2, 0)
 
+@partial(_sum_blocks.defjvp, symbolic_zeros=True)
+def _sum_blocks_jvp(term: Term, primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
+    numbers, structure = jax.tree.flatten(primals)
+    pushes = structure.flatten_up_to(tangents)
+    moving = [i for i, push in enumerate(pushes) if not isinstance(push, SymbolicZero)]
+
+    def fold(*moved: Array) -> list[Array]:
+        now = dict(zip(moving, moved, strict=True))
+        return _fold_tiles(term, *structure.unflatten(now.get(i, number) for i, number in enumerate(numbers)))
+
+    return jax.jvp(fold, [numbers[i] for i in moving], [pushes[i] for i in moving])
+
+
+def _fold_tiles(term: Term, bodies: list[Array], strength: Array, softening: Array | None) -> list[Array]:
+    """The sum folded over tiles of sources; the last tile is padded with sources of zero strength."""
+    count = strength.shape[-1]
+    most = choose_tile_sources(count)
+
+    def add(total: list[Array], sources: list[Array], strength: Array) -> list[Array]:
+        found = _sum_pairs(term, bodies, sources, strength, softening)
+        return [a + b for a, b in zip(total, found, strict=True)]
+
+    kinds = jax.eval_shape(partial(_sum_pairs, term), bodies, bodies, strength, softening)
+    total = [jnp.zeros(kind.shape, kind.dtype) for kind in kinds]
+    if count <= most:
+        return add(total, bodies, strength)
+    tiles = lambda a: _cut(a, -(-count // most), most)  # noqa: E731
     # recomputing a tile in reverse mode keeps its memory linear too
     body = jax.checkpoint(lambda total, tile: (add(total, *tile), None), prevent_cse=False)
-    return lax.scan(body, total, ([tiles(c) for c in sources], tiles(strength)))[0]
+    return lax.scan(body, total, ([tiles(c) for c in bodies], tiles(strength)))[0]
+
+
+def _cut(a: Array, blocks: int, size: int | None = None) -> Array:
+    """The last axis cut into blocks of a size, or of equal sizes, along a new first axis; filled up with zeros."""
+    count = a.shape[-1]
+    size = -(-count // blocks) if size is None else size
+    filled = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, blocks * size - count)])
+    return jnp.moveaxis(filled.reshape((*a.shape[:-1], blocks, size)), -2, 0)
 
 
 __all__ = ["Gravitation"]

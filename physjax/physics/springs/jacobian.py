@@ -1,8 +1,10 @@
 """Springs linearised at a state, for implicit steps, with a Jacobian that is symmetric and negative semidefinite."""
 
-from typing import ClassVar, NamedTuple
+import operator
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -16,7 +18,7 @@ from physjax.physics.springs.topology import SpringTopology
 class LinearisedSlot(NamedTuple):
     """The springs of a slot at a state: differences of position d [m], by layout and by component, and g, h, γ."""
 
-    edge: Array
+    edge: Any
     along: list[Array]
     g: Array
     h: Array
@@ -41,18 +43,19 @@ class LinearisedSprings(Force):
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes dim"]:
         """The force [N], affine in the state."""
-        topology = self.topology
+        topology, near = self.topology, self.topology.neighbours
         moved = [a - b for a, b in zip(state, self.state, strict=True)]
         damped = self.springs[0].gamma is not None
-        parts = topology.parts(*(moved if damped else moved[:1]))
+        edges, parts = topology.differences(*(moved if damped else moved[:1]))
         pulls = []
-        for slot, (edge, at) in enumerate(zip(topology.edges(moved[0]), self.springs, strict=True)):
+        for slot, (edge, at) in enumerate(zip(edges, self.springs, strict=True)):
             pull = at.h * product(at.along, parts[0][slot])
             if at.gamma is not None:
                 pull = pull + at.gamma * product(at.along, parts[1][slot])
             # materialised: every component of the force reads it
             pull = block_fusion(pull)
-            pulls.append(topology.neighbours.scale_edges(at.g, edge) + topology.neighbours.scale_edges(pull, at.edge))
+            terms = near.scale_edges(at.g, edge), near.scale_edges(pull, at.edge)
+            pulls.append(jax.tree.map(operator.add, *terms))
         return self.force + topology.resultant(pulls)
 
 

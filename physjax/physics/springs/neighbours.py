@@ -89,6 +89,10 @@ class Bands(NamedTuple):
             return np.pad(number[..., slot, :], width)  # of the topology: a constant of the program
         return jnp.pad(number[..., slot, :], width)
 
+    def store(self, weights: list[Array]) -> list[Array]:
+        """The weights of all springs, stored: else XLA on CPU computes them again for every component and both ends."""
+        return [block_fusion(weight) for weight in weights]
+
     def scale_edges(self, number: Array, edge: Array) -> Array:
         """A number of each spring times a difference."""
         return number[..., None, :] * edge
@@ -137,6 +141,10 @@ class Table(NamedTuple):
     def at(self, number: AnyArray, slot: int) -> AnyArray:
         """A number in slots, taken at one of them."""
         return number[..., slot, :]
+
+    def store(self, weights: list[Array]) -> list[Array]:
+        """The weights of all springs, stored: else XLA on CPU computes them again for every component and both ends."""
+        return [block_fusion(weight) for weight in weights]
 
     def scale_edges(self, number: Array, edge: Array) -> Array:
         """A number of each spring times a difference."""

@@ -8,7 +8,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import block_fusion
 from physjax.checks import NestedArrayLike, as_positive_integer, as_real_quantity, unchecked_quantity
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
@@ -109,9 +108,9 @@ class Springs(Force):
         """Σ (k (1 - L/l) + c (d·ḋ)/l²) d over the springs of each node, d to the other end [N]."""
         self._demand_nodes(state)
         topology, c = self.topology, self.c
-        parts = topology.parts(*(state[:1] if c is None else state))
-        pulls = []
-        for slot, (edge, d) in enumerate(zip(topology.edges(state.position), parts[0], strict=True)):
+        edges, parts = topology.differences(*(state[:1] if c is None else state))
+        weights = []
+        for slot, d in enumerate(parts[0]):
             k, L = self._take_slot(slot, self.k, d), self._take_slot(slot, self.L, d)
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)  # ends that coincide: no division by 0, also in derivatives
@@ -119,17 +118,16 @@ class Springs(Force):
             pull = k * (apart - L * square_root(square))
             if c is not None:
                 pull = pull + self._take_slot(slot, c, d) * product(d, parts[1][slot])
-            # materialised, or XLA would compute it again for every component and both ends; the division comes last
-            # because older compilers materialise a division by themselves
-            weight = block_fusion(jnp.where(self._take_unbroken(slot, d), pull, 0.0) / apart)
-            pulls.append(topology.neighbours.scale_edges(weight, edge))
-        return topology.resultant(pulls)
+            # the division comes last because older compilers materialise a division by themselves
+            weights.append(jnp.where(self._take_unbroken(slot, d), pull, 0.0) / apart)
+        near = topology.neighbours
+        return topology.resultant([near.scale_edges(w, e) for w, e in zip(near.store(weights), edges, strict=True)])
 
     def linearised_at(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> LinearisedSprings:
         """The springs linearised at a state, with a negative semidefinite Jacobian, as an implicit step uses them."""
         springs = []
-        x = state.position
-        for slot, (edge, d) in enumerate(zip(self.topology.edges(x), self.topology.parts(x)[0], strict=True)):
+        edges, (parts,) = self.topology.differences(state.position)
+        for slot, (edge, d) in enumerate(zip(edges, parts, strict=True)):
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
             unbroken = self._take_unbroken(slot, d)
@@ -145,7 +143,7 @@ class Springs(Force):
         """½k(l - L)² [J], half of it at each end."""
         self._demand_nodes(state)
         energies = []
-        for slot, d in enumerate(self.topology.parts(state.position)[0]):
+        for slot, d in enumerate(self.topology.parts(state.position)):
             stretch = square_root(product(d, d)) - self._take_slot(slot, self.L, d)
             energy = 0.25 * self._take_slot(slot, self.k, d) * stretch * stretch
             energies.append(jnp.where(self._take_unbroken(slot, d), energy, 0.0))
@@ -162,7 +160,7 @@ class Springs(Force):
             return self, state
         self._demand_nodes(state)
         held = []
-        for slot, d in enumerate(self.topology.parts(state.position)[0]):
+        for slot, d in enumerate(self.topology.parts(state.position)):
             L, limit = self._take_slot(slot, self.L, d), self._take_slot(slot, self.limit, d)
             square = product(d, d)
             held.append(self._take_slot(slot, self.intact, d) & (square <= (L * (1 + limit)) ** 2))

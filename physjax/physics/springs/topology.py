@@ -1,12 +1,14 @@
 """Which nodes are joined by springs, and in which layout (`neighbours`) they are kept."""
 
-from functools import partial
+from functools import cached_property, partial
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from physjax.backend import SPRINGS_AT_BOTH_ENDS, splits_vectors
 from physjax.checks import NestedArrayLike
+from physjax.physics.springs.component_neighbours import GatheredNodes, ShiftedNodes
 from physjax.physics.springs.custom_transpose import apply_linear
 from physjax.physics.springs.neighbours import Bands, Table, rank_in_group
 
@@ -32,12 +34,12 @@ class SpringTopology:
         fits = len(offsets) <= MAX_BANDS and len(offsets) * self.nodes <= MAX_SLOTS_PER_SPRING * len(low)
         self.layout = layout or ("bands" if fits else "gather")
         if self.layout == "bands":
-            owner, self.neighbours = low, Bands(offsets)
+            owner, self._whole = low, Bands(offsets)
         else:
             # a row of arrivals for the most that arrive anywhere: as many as leave, where owners are balanced
             owner, other = _balance_owners(self.pairs, self.nodes)
             slot = rank_in_group(owner, self.nodes)
-            self.neighbours = _build_table(owner, other, slot, self.nodes)
+            self._whole = _build_table(owner, other, slot, self.nodes)
         self.slots = int(slot.max()) + 1
         self.places = slot * self.nodes + owner
         self.present = np.zeros((self.slots, self.nodes), bool)
@@ -58,6 +60,17 @@ class SpringTopology:
     def __repr__(self) -> str:
         return f"<{len(self.pairs)} pairs of {self.nodes} nodes, {self.layout}: {self.slots}>"
 
+    @property
+    def neighbours(self) -> Bands | Table | ShiftedNodes | GatheredNodes:
+        """How a step reads neighbours on the device that computes: of whole vectors, or by components."""
+        return self._by_component if splits_vectors() else self._whole
+
+    @cached_property
+    def _by_component(self) -> ShiftedNodes | GatheredNodes:
+        if isinstance(self._whole, Bands):
+            return ShiftedNodes(self._whole.offsets, SPRINGS_AT_BOTH_ENDS)
+        return GatheredNodes(*self._whole, SPRINGS_AT_BOTH_ENDS)
+
     def spread(self, number: Array) -> Array:
         """A number per spring, `(*scenes, springs)`, in its slots; one for all, `()` or `(*scenes, 1)`, stays one."""
         if number.ndim == 0 or (number.shape[-1] == 1 and len(self.pairs) > 1):
@@ -76,25 +89,32 @@ class SpringTopology:
             return slots if slots.ndim == 0 else slots[..., 0]
         return slots.reshape((*slots.shape[:-2], -1))[..., self.places]
 
-    def edges(self, x: Float[Array, "*scenes nodes dim"]) -> list[Array]:
-        """Differences between both ends of the springs, slot by slot, with the axes of the layout."""
-        return apply_linear(self.neighbours.edges, self.neighbours.ends, (x,))
-
-    def parts(self, *arrays: Float[Array, "*scenes nodes dim"]) -> list[list[list[Array]]]:
-        """Differences between both ends for each array, slot by slot, component by component."""
-        dim = arrays[0].shape[-1]
-        if isinstance(self.neighbours, Bands):
-            found = apply_linear(self.neighbours.parts, partial(self.neighbours.transpose_parts, dim), arrays)
+    def differences(self, *arrays: Float[Array, "*scenes nodes dim"]) -> tuple[list, list[list[list[Array]]]]:
+        """Differences between both ends: of the first array, slot by slot, as `scale_edges` of the neighbours takes them;
+        and of each array slot by slot, component by component.
+        """
+        near, dim = self.neighbours, arrays[0].shape[-1]
+        if isinstance(near, ShiftedNodes | GatheredNodes):
+            parts = near.differences(*arrays)
+            return parts[0], parts
+        edges = apply_linear(near.edges, near.ends, arrays[:1])
+        if isinstance(near, Bands):
+            found = apply_linear(near.parts, partial(near.transpose_parts, dim), arrays)
         else:
-            found = [
-                e[..., i] for e in apply_linear(self.neighbours.edges, self.neighbours.ends, arrays) for i in range(dim)
-            ]
+            found = [e[..., i] for e in apply_linear(near.edges, near.ends, arrays) for i in range(dim)]
         slots = [found[i : i + dim] for i in range(0, len(found), dim)]
-        return [slots[i : i + self.slots] for i in range(0, len(slots), self.slots)]
+        return edges, [slots[i : i + self.slots] for i in range(0, len(slots), self.slots)]
 
-    def resultant(self, pulls: list[Array]) -> Float[Array, "*scenes nodes dim"]:
+    def parts(self, x: Float[Array, "*scenes nodes dim"]) -> list[list[Array]]:
+        """Differences between both ends, slot by slot, component by component."""
+        return self.differences(x)[1][0]
+
+    def resultant(self, pulls: list) -> Float[Array, "*scenes nodes dim"]:
         """The sum of the pulls on each node: plus those of the springs that it owns, minus those that arrive."""
-        return -apply_linear(self.neighbours.ends, self.neighbours.edges, tuple(pulls))[0]
+        near = self.neighbours
+        if isinstance(near, Bands | Table):
+            return -apply_linear(near.ends, near.edges, tuple(pulls))[0]
+        return near.resultant(pulls)
 
     def ends(self, a: Float[Array, "*scenes nodes dim"]) -> tuple[Array, Array]:
         """The vectors of the first and of the second node of each pair, `(*scenes, springs, dim)`."""
