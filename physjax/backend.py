@@ -24,7 +24,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +68,12 @@ SPRINGS_AT_BOTH_ENDS = True
 """Whether a GPU computes each spring at both of its ends, in one kernel a step, or once, which stores it in between."""
 STORES_STATE = True
 """Whether a GPU stores the state before each evaluation of coupled forces."""
+PAIRS_IN_KERNEL = True
+"""Whether a GPU sums over pairs in a kernel; else in a reduction, of which XLA stores a block's pairs."""
+PAIR_TARGETS, PAIR_SOURCES, PAIR_WARPS, PAIR_PROGRAMS = 64, 32, 4, 1024
+"""Targets and sources in a tile of that kernel, warps that share it, and how many blocks fill a card."""
+MIN_BODIES_FOR_KERNEL = 256
+"""The pairs of fewer bodies are few."""
 WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
 """XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster."""
 OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
@@ -372,6 +378,28 @@ def choose_block_targets(bodies: int) -> int | None:
     not stored: G pairs/s in blocks of sources 24, 82 and 184, in one 86, 350 and 363 (4096, 16 384, 65 536 bodies, H200).
     """
     return None if on_cpu() else min(bodies, TARGETS_PER_BLOCK)
+
+
+class PairKernel(NamedTuple):
+    """Targets and sources in a tile, in how many shares the sources are summed side by side, and what Pallas is told."""
+
+    targets: int
+    sources: int
+    shares: int
+    options: dict[str, Any]
+
+
+def choose_pair_kernel(bodies: int) -> PairKernel | None:
+    """How a GPU sums over all pairs of bodies in one kernel; None where that is a reduction."""
+    if on_cpu() or not PAIRS_IN_KERNEL or bodies < MIN_BODIES_FOR_KERNEL:
+        return None
+    shares = max(1, min(PAIR_PROGRAMS * PAIR_TARGETS // bodies, bodies // (4 * PAIR_SOURCES)))
+    if jax.default_backend() == "cpu":  # as if for a GPU, in tests
+        return PairKernel(PAIR_TARGETS, PAIR_SOURCES, shares, {"interpret": True})
+    from jax.experimental.pallas import triton
+
+    options = {"compiler_params": triton.CompilerParams(num_warps=PAIR_WARPS, num_stages=1)}
+    return PairKernel(PAIR_TARGETS, PAIR_SOURCES, shares, options)
 
 
 def choose_tile_sources(bodies: int) -> int:

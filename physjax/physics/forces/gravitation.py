@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import SUMS_OVER_LAST_AXIS, choose_block_targets, choose_tile_sources
+from physjax.backend import SUMS_OVER_LAST_AXIS, choose_block_targets, choose_pair_kernel, choose_tile_sources
 from physjax.checks import Numbers, OptionalNumbers, quantity
 from physjax.particles import Particles
 from physjax.parts import Field
@@ -110,6 +110,14 @@ def _sum_blocks(term: Term, bodies: list[Array], strength: Array, softening: Arr
     gradient does, so derivatives are of the sum by tiles, whose pairs may be stored.
     """
     count = strength.shape[-1]
+    kernel = choose_pair_kernel(count)
+    if kernel is not None:
+        from physjax.physics.forces.pair_kernel import sum_pairs_in_kernel  # Pallas takes a while to import
+
+        alone = lambda bodies, strength: sum_pairs_in_kernel(term, bodies, strength, softening, kernel)  # noqa: E731
+        for _ in strength.shape[:-1]:
+            alone = jax.vmap(alone)
+        return alone(bodies, strength)
     sums = lambda targets: _sum_pairs(  # noqa: E731
         term, targets, bodies, strength, softening, -1 if SUMS_OVER_LAST_AXIS else -2
     )
