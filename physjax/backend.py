@@ -8,7 +8,8 @@ Each policy has its reason and its measurement next to it. CPU figures are of tw
   `store_on_any_device`, `SPRINGS_AT_BOTH_ENDS`.
 - How a loop is compiled: `split_compilation`, `bounded_while_loop`, `needs_split_compilation`.
 - Which lanes are computed: `compact_and_apply`, `compact_and_apply_runs`.
-- How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `choose_block_targets`, `choose_tile_sources`.
+- How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `choose_block_targets`, `choose_pair_kernel`,
+  `choose_tile_sources`.
 - What the compiler is asked for: `jit_untransformed`.
 - What its programs depend on: `name_compiler_target`.
 - Which clock a search goes by, and how a device is called: `read_work_clock`, `device_kind`, `describe_device`.
@@ -58,22 +59,22 @@ SOURCES_PER_TILE = 64
 PAIRS_PER_TILE = 2**19
 """Pairs in a tile elsewhere, where a tile's are stored: 2 MB for each array of them in float32, in each of many scenes."""
 TARGETS_PER_BLOCK = 4096
-"""Bodies for which the attraction of all others is summed at once where that is one kernel: enough to fill a card.
-
-The memory of a block would be linear in the number of bodies even if its pairs were stored.
-"""
-SUMS_OVER_LAST_AXIS = True
-"""Whether that sum is over the last axis of (targets, sources), or over the first of (sources, targets)."""
+"""Bodies for which the attraction of all others is one reduction, which may store its pairs: enough to fill a card."""
 SPRINGS_AT_BOTH_ENDS = True
-"""Whether a GPU computes each spring at both of its ends, in one kernel a step, or once, which stores it in between."""
-STORES_STATE = True
-"""Whether a GPU stores the state before each evaluation of coupled forces."""
+"""Whether a GPU computes each spring at both of its ends, or once and stores what both ends read.
+
+At both ends a step is one kernel: for a cloth of six bands 12 roots and 119 reads a node. Once, it is two, with 6 numbers a
+node written and read back between them.
+"""
 PAIRS_IN_KERNEL = True
-"""Whether a GPU sums over pairs in a kernel; else in a reduction, of which XLA stores a block's pairs."""
+"""Whether a GPU sums over pairs in a kernel.
+
+In a reduction XLA stores what the components of a pair's pull share: 17 GB for 65 536 bodies without blocks.
+"""
 PAIR_TARGETS, PAIR_SOURCES, PAIR_WARPS, PAIR_PROGRAMS = 64, 32, 4, 1024
-"""Targets and sources in a tile of that kernel, warps that share it, and how many blocks fill a card."""
+"""Targets and sources in a tile of that kernel, 16 pairs for each thread; warps that share it; and how many tiles fill a card."""
 MIN_BODIES_FOR_KERNEL = 256
-"""The pairs of fewer bodies are few."""
+"""With fewer bodies a reduction stores less than a card's cache holds."""
 WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
 """XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster."""
 OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
@@ -205,7 +206,10 @@ def evaluate_coupled(t: ArrayLike, function: Callable[[S], T], state: S) -> T:
     """
     if on_cpu():
         return materialise(t, lambda: function(state))
-    return function(store_on_any_device(state) if STORES_STATE else state)
+    if jit_is_disabled():  # a checkpoint traces in any case, and would hide the numbers from a debugger
+        return function(state)
+    # computed again in reverse mode: storing what a spring's derivative needs takes longer than finding it
+    return jax.checkpoint(function, prevent_cse=False)(store_on_any_device(state))
 
 
 # how a loop is compiled
@@ -374,8 +378,8 @@ def choose_block_lanes(device: Device, carried_bytes: int) -> int:
 def choose_block_targets(bodies: int) -> int | None:
     """For how many of so many bodies the attraction of all is summed at once; None: it is folded over tiles of sources.
 
-    On a CPU the pairs of a tile stay in a cache. A GPU is faster with one reduction over all sources, whose pairs are
-    not stored: G pairs/s in blocks of sources 24, 82 and 184, in one 86, 350 and 363 (4096, 16 384, 65 536 bodies, H200).
+    On a CPU the pairs of a tile stay in a cache. A GPU is faster with all sources at once: 24, 82 and 184 G pairs/s in
+    tiles, 86, 350 and 363 in one reduction (4096, 16 384, 65 536 bodies, H200).
     """
     return None if on_cpu() else min(bodies, TARGETS_PER_BLOCK)
 
@@ -391,7 +395,7 @@ class PairKernel(NamedTuple):
 
 def choose_pair_kernel(bodies: int) -> PairKernel | None:
     """How a GPU sums over all pairs of bodies in one kernel; None where that is a reduction."""
-    if on_cpu() or not PAIRS_IN_KERNEL or bodies < MIN_BODIES_FOR_KERNEL:
+    if device_kind() != "gpu" or not PAIRS_IN_KERNEL or bodies < MIN_BODIES_FOR_KERNEL:
         return None
     shares = max(1, min(PAIR_PROGRAMS * PAIR_TARGETS // bodies, bodies // (4 * PAIR_SOURCES)))
     if jax.default_backend() == "cpu":  # as if for a GPU, in tests

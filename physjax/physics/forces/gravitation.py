@@ -1,7 +1,7 @@
 """Newtonian gravitation between all pairs, in blocks: memory stays linear in the number of bodies.
 
-On a CPU the sums are folded over tiles of sources. Elsewhere a block of targets sums over all sources at once, which is
-one reduction; its derivatives are those of the fold.
+On a CPU the sums are folded over tiles of sources. A GPU has a kernel that goes over all sources at once (`pair_kernel`),
+and any other device one reduction for each block of targets; the derivatives of both are those of the fold.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import SUMS_OVER_LAST_AXIS, choose_block_targets, choose_pair_kernel, choose_tile_sources
+from physjax.backend import choose_block_targets, choose_pair_kernel, choose_tile_sources
 from physjax.checks import Numbers, OptionalNumbers, quantity
 from physjax.particles import Particles
 from physjax.parts import Field
@@ -90,46 +90,42 @@ def _sum_over_sources(term: Term, x: Array, strength: Array, softening: Array | 
     bodies = [x[..., i] for i in range(x.shape[-1])]
     if choose_block_targets(strength.shape[-1]) is None:
         return _fold_tiles(term, bodies, strength, softening)
-    return _sum_blocks(term, bodies, strength, softening)
+    return _sum_at_once(term, bodies, strength, softening)
 
 
 def _sum_pairs(
-    term: Term, targets: list[Array], sources: list[Array], strength: Array, softening: Array | None, axis: int = -1
+    term: Term, targets: list[Array], sources: list[Array], strength: Array, softening: Array | None
 ) -> list[Array]:
-    """The sum of a term over some sources for some targets; `axis` is that of the sources, the last or the one before."""
-    other = -3 - axis
-    offsets = [jnp.expand_dims(s, other) - jnp.expand_dims(x, axis) for s, x in zip(sources, targets, strict=True)]
-    return [jnp.sum(part, axis=axis) for part in term(offsets, jnp.expand_dims(strength, other), softening)]
+    """The sum of a term over some sources for some targets."""
+    offsets = [s[..., None, :] - x[..., :, None] for s, x in zip(sources, targets, strict=True)]
+    return [jnp.sum(part, axis=-1) for part in term(offsets, strength[..., None, :], softening)]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _sum_blocks(term: Term, bodies: list[Array], strength: Array, softening: Array | None) -> list[Array]:
-    """The sum over all sources at once, for one block of targets after the other.
+def _sum_at_once(term: Term, bodies: list[Array], strength: Array, softening: Array | None) -> list[Array]:
+    """The sum over all sources at once, by a kernel or for one block of targets after the other.
 
-    A compiler that fuses stores none of a block's pairs. One reduction cannot go over sources and targets both, as a
-    gradient does, so derivatives are of the sum by tiles, whose pairs may be stored.
+    In a gradient a pair has something for its source as well as for its target, which no single reduction adds up:
+    derivatives are of the sum by tiles, whose pairs are stored.
     """
-    count = strength.shape[-1]
+    count, lanes = strength.shape[-1], strength.shape[:-1]
     kernel = choose_pair_kernel(count)
     if kernel is not None:
         from physjax.physics.forces.pair_kernel import sum_pairs_in_kernel  # Pallas takes a while to import
 
-        alone = lambda bodies, strength: sum_pairs_in_kernel(term, bodies, strength, softening, kernel)  # noqa: E731
-        for _ in strength.shape[:-1]:
-            alone = jax.vmap(alone)
-        return alone(bodies, strength)
-    sums = lambda targets: _sum_pairs(  # noqa: E731
-        term, targets, bodies, strength, softening, -1 if SUMS_OVER_LAST_AXIS else -2
-    )
+        by_scene = lambda bodies, strength: sum_pairs_in_kernel(term, bodies, strength, softening, kernel)  # noqa: E731
+        for _ in lanes:
+            by_scene = jax.vmap(by_scene)
+        return by_scene(bodies, strength)
     blocks = -(-count // (choose_block_targets(count) or count))
     if blocks == 1:
-        return sums(bodies)
-    found = lax.map(sums, [_cut(x, blocks) for x in bodies])
-    return [jnp.moveaxis(a, 0, -2).reshape((*strength.shape[:-1], -1))[..., :count] for a in found]
+        return _sum_pairs(term, bodies, bodies, strength, softening)
+    found = lax.map(lambda some: _sum_pairs(term, some, bodies, strength, softening), [_cut(x, blocks) for x in bodies])
+    return [jnp.moveaxis(a, 0, -2).reshape((*lanes, -1))[..., :count] for a in found]
 
 
-@partial(_sum_blocks.defjvp, symbolic_zeros=True)
-def _sum_blocks_jvp(term: Term, primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
+@partial(_sum_at_once.defjvp, symbolic_zeros=True)
+def _push_sum(term: Term, primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
     numbers, structure = jax.tree.flatten(primals)
     pushes = structure.flatten_up_to(tangents)
     moving = [i for i, push in enumerate(pushes) if not isinstance(push, SymbolicZero)]

@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import block_fusion, materialise
+from physjax.backend import materialise
 from physjax.checks import Numbers, OptionalNumbers, quantity
 from physjax.particles import Particles, sum_terms
 from physjax.parts import Force
@@ -19,8 +19,7 @@ from physjax.vectors import broadcast_vector, cross, dot, norm, scale, unit
 class Cells:
     """The cells of a sheet of rows × columns nodes, by shifted slices; each of the four corners gets a quarter of a force.
 
-    The sheet is continued by one row and column on every side that coincide with its edge: every node then has four
-    cells, and those without area have no force.
+    Around the sheet there are cells without force, so that every node has four.
     """
 
     def __init__(self, rows: int, columns: int):
@@ -45,15 +44,14 @@ class Cells:
 
     def sum_at_nodes(self, newtons: Array) -> Array:
         """The forces of the cells [N] distributed to their corners, `(*scenes, nodes, 3)`."""
-        total = 0.25 * sum_terms(self._slice_shifted(newtons, self.rows, self.columns))
+        wide = jnp.pad(newtons, [(0, 0)] * (newtons.ndim - 3) + [(1, 1), (1, 1), (0, 0)])
+        total = 0.25 * sum_terms(self._slice_shifted(wide, self.rows, self.columns))
         return total.reshape((*newtons.shape[:-3], self.nodes, newtons.shape[-1]))
 
     def _take_corners(self, a: Array) -> list[Array]:
         """The vectors at the four corners of each cell: upper left, upper right, lower left, lower right."""
         sheet = a.reshape((*a.shape[:-2], self.rows, self.columns, a.shape[-1]))
-        wide = jnp.pad(sheet, [(0, 0)] * (sheet.ndim - 3) + [(1, 1), (1, 1), (0, 0)], mode="edge")
-        # four slices of one array in memory; fused, the padding would be computed four times
-        return self._slice_shifted(block_fusion(wide), self.rows + 1, self.columns + 1)
+        return self._slice_shifted(sheet, self.rows - 1, self.columns - 1)
 
     def _slice_shifted(self, a: Array, rows: int, columns: int) -> list[Array]:
         """The four windows of a size in a sheet, shifted by one row and one column."""

@@ -1,13 +1,14 @@
 """Bodies attract each other as Newton says, in tiles that cost linear memory and change nothing."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, forces, methods, simulate
+from physjax import Particles, Scene, backend, forces, methods, simulate
 from physjax.backend import SOURCES_PER_TILE
 
 
@@ -188,10 +189,42 @@ def test_memory_is_linear_in_the_number_of_bodies(reverse):
         x = jax.ShapeDtypeStruct((n, 3), jnp.float32)
         return jax.jit(function).lower(x).compile().memory_analysis().temp_size_in_bytes
 
+    # so many that blocks of a size that suits a card, which may be stored, are few beside all pairs
     with jax.enable_x64(False):
-        small, large = needed(2048), needed(4096)
-    assert large < 4096 * 4096 * 4 / 8
-    assert large < 2.2 * small
+        small, large = needed(16_384), needed(32_768)
+    assert large < 32_768 * 32_768 * 4 / 8
+    assert large < 2.2 * small + 4096
+
+
+def compare_as_if_for_a_gpu(monkeypatch, way, compute, *numbers):
+    """What is traced for a CPU and as if for a GPU, in one of its ways, gives the same to rounding."""
+    wanted = jax.jit(lambda *a: compute(*a))(*numbers)
+    monkeypatch.setattr(backend, "device_kind", lambda: "gpu")
+    monkeypatch.setattr(backend, "MIN_BODIES_FOR_KERNEL", 1 if way == "kernel" else 10**9)
+    monkeypatch.setattr(backend, "TARGETS_PER_BLOCK", 16 if way == "blocks" else 4096)
+    found = jax.jit(lambda *a: compute(*a))(*numbers)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("way", ["kernel", "reduction", "blocks"])
+def test_a_gpu_finds_the_same_as_a_cpu(way, monkeypatch):
+    find = partial(attraction_and_energy.__wrapped__, forces.Gravitation(G=0.7, softening=0.05))
+    x, mass = map(jnp.asarray, bodies(2, SOURCES_PER_TILE + 7, 3))
+    compare_as_if_for_a_gpu(monkeypatch, way, lambda *a: (find(*a), jax.vmap(find)(*a)), x, mass)
+
+
+def test_its_derivatives_are_those_of_the_sum_by_tiles(monkeypatch):
+    def weigh(softening, x, mass):
+        force = forces.Gravitation(G=0.7, softening=softening)
+        return sum(jnp.sum(part**3) for part in attraction_and_energy.__wrapped__(force, x, mass))
+
+    (x, u), (mass, _) = map(jnp.asarray, bodies(2, SOURCES_PER_TILE + 7, 2))
+    compute = lambda *a: (  # noqa: E731
+        jax.grad(weigh, argnums=(0, 1, 2))(*a),
+        jax.jvp(jax.grad(lambda x: weigh(a[0], x, a[2])), (x,), (u,)),
+    )
+    compare_as_if_for_a_gpu(monkeypatch, "reduction", compute, jnp.asarray(0.05), x, mass)
 
 
 def test_a_single_point_is_no_system_of_bodies():
