@@ -211,6 +211,7 @@ def test_coupled_bodies_bounce_too():
         (lambda: contacts.Plane((0, 0), (0, 1), restitution=-0.1), "from 0 to 1"),
         (lambda: contacts.Plane((0, 0), (0, 1), friction=2.0), "from 0 to 1"),
         (lambda: contacts.Plane((0, 0), (0, 1), friction=0.1, coulomb=contacts.Coulomb(1, 1)), "at most one"),
+        (lambda: contacts.Plane((0, 0), (0, 1), coulomb=0.4), r"coulomb: got 0\.4, expected contacts\.Coulomb"),
         (lambda: contacts.Plane(**FLOOR, response="impact"), "expected contacts.impact"),
         (lambda: contacts.Coulomb(0.2, 0.3), "at most the static"),
         (lambda: contacts.Coulomb(-0.2, -0.3), ">= 0"),
