@@ -97,13 +97,13 @@ def passes_made(ball, bounced_axis, count, seed):
 
 @pytest.mark.parametrize("what", ["floor", "board"])
 def test_no_right_arc_is_denied(what, precision):
-    """Of 200 targets that a bounce leads to: all are hit to rounding, lane by lane and mapped, and move with them."""
+    """Of 100 targets that a bounce leads to: all are hit to rounding, lane by lane and mapped, and move with them."""
     place, normal, axis = {"floor": ((0.0, 0.0), (0.0, 1.0), 1), "board": ((4.0, 0.0), (-1.0, 0.0), 0)}[what]
     start = jnp.array([0.0, 2.0], precision.dtype)
     loads = (forces.Gravity(), forces.QuadraticDrag(0.045, 0.3))
     surface = contacts.Plane(point=place, normal=normal, restitution=0.8)
     ball = Scene(Particles(start, jnp.zeros_like(start)), 0.6, loads, (surface,))
-    targets = passes_made(ball, axis, 200, 3)
+    targets = passes_made(ball, axis, 100, 3)
 
     def aimed(targets):
         shots = aim_at(ball, targets, speed=SPEED, bounces=1)
@@ -116,4 +116,4 @@ def test_no_right_arc_is_denied(what, precision):
         assert shot.ok.all()
         assert (np.asarray(shot.miss) / extent).max() < 64 * precision.eps
     assert (np.asarray(moves) != 0).all()
-    assert jax.jit(jax.vmap(lambda target: aimed(target)[1][0].ok))(targets).all()
+    assert jax.jit(jax.vmap(lambda target: aimed(target)[1][0].ok))(targets[::4]).all()
