@@ -6,25 +6,22 @@ Each policy has its reason and its measurement next to it. CPU figures are of tw
 - What is computed by components: `splits_vectors`.
 - What is computed once: `any_lane`, `materialise`, `materialise_where`, `block_fusion`, `evaluate_coupled`,
   `store_on_any_device`, `SPRINGS_AT_BOTH_ENDS`.
-- How a loop is compiled: `split_compilation`, `bounded_while_loop`, `needs_split_compilation`.
-- Which lanes are computed: `compact_and_apply`, `compact_and_apply_runs`.
-- How much is computed at once: `count_lane_blocks`, `choose_block_lanes`, `choose_block_targets`, `choose_pair_kernel`,
-  `choose_tile_sources`.
+- How a loop is compiled: `split_compilation`, `compiles_loop_in_pieces`, `needs_split_compilation`.
+- How many steps are a kernel: `choose_unrolled_steps`, `runs_as_kernel`, `choose_kernel_shape`.
+- How much is computed at once: `choose_group_lanes`, `count_lane_blocks`, `choose_block_lanes`, `choose_block_targets`,
+  `choose_pair_kernel`, `choose_tile_sources`.
 - What the compiler is asked for: `jit_untransformed`.
-- What its programs depend on: `name_compiler_target`.
 - Which clock a search goes by, and how a device is called: `read_work_clock`, `device_kind`, `describe_device`.
 """
 
 import functools
-import hashlib
 import math
 import platform
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
-from importlib.metadata import version
-from pathlib import Path
+from importlib.util import find_spec
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -33,8 +30,6 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, PyTree
 
-S = TypeVar("S")
-"""A tree of arrays that goes in."""
 T = TypeVar("T")
 """A tree of arrays that comes back with the same structure and shapes."""
 
@@ -42,6 +37,8 @@ MIN_LANES_TO_SELECT = 1024
 """Below this many lanes computing all of them costs less than gathering and scattering those that are flagged."""
 GROUPS_PER_SCENE = 32
 """Flagged lanes are computed in groups of one lane in 32: a group's cost is paid whole, however few lanes are in it."""
+MIN_GROUP_LANES_ON_GPU = 65_536
+"""Fewer lanes do not fill a card of 132 multiprocessors."""
 SINGLE_PIECE_NODES = 64
 """Coupled scenes with at most this many nodes are compiled as one piece, which runs faster and still compiles quickly."""
 LANES_PER_BLOCK = 8192
@@ -54,6 +51,16 @@ MAX_CARRIED_BYTES = 64 * LANES_PER_BLOCK
 """Bytes of a sweep's block that one turn of a loop hands to the next, to stay in a core's cache with a step's stages."""
 MAX_BATCH_LANES = 16 * LANES_PER_BLOCK
 """Lanes in a batch of a sweep at most: more gain nothing, and a batch is what a kill loses."""
+MAX_UNROLLED_STEPS, MAX_UNROLLED_OPERATIONS = 16, 2500
+"""Steps that a turn of a loop takes on a GPU at most, and operations in them."""
+KERNEL_LANES = 128
+"""Lanes in a block of a kernel, a thread each; 32 and 256 are no faster."""
+MAX_KERNEL_OPERATIONS = 5000
+"""The most operations in a kernel's step; a longer one takes the plain loop.
+
+A bounce off a plane has 2300 and compiles in 1 s, one in a room 4000 in the plane and 10 000 in space, which takes 9 s; a
+box that falls on a floor has 14 000, and takes 70.
+"""
 SOURCES_PER_TILE = 64
 """Bodies whose attraction is summed at once on a CPU: few enough for registers and caches, enough to hide the loop over tiles."""
 PAIRS_PER_TILE = 2**19
@@ -66,13 +73,8 @@ SPRINGS_AT_BOTH_ENDS = True
 At both ends a step is one kernel: for a cloth of six bands 12 roots and 119 reads a node. Once, it is two, with 6 numbers a
 node written and read back between them.
 """
-PAIRS_IN_KERNEL = True
-"""Whether a GPU sums over pairs in a kernel.
-
-In a reduction XLA stores what the components of a pair's pull share: 17 GB for 65 536 bodies without blocks.
-"""
 PAIR_TARGETS, PAIR_SOURCES, PAIR_WARPS, PAIR_PROGRAMS = 64, 32, 4, 1024
-"""Targets and sources in a tile of that kernel, 16 pairs for each thread; warps that share it; and how many tiles fill a card."""
+"""Targets and sources in a tile of that kernel, 16 pairs for each thread; warps that share it; how many tiles fill a card."""
 MIN_BODIES_FOR_KERNEL = 256
 """With fewer bodies a reduction stores less than a card's cache holds."""
 WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
@@ -81,6 +83,13 @@ OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 """Timed contacts are many small kernels, over which the emitters of jax 0.10 take twice the compile time of the older ones.
 
 From jax 0.11 on there are no others, and the option is gone.
+"""
+COMMAND_BUFFER_OPTIONS = {
+    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,WHILE,CONDITIONAL"
+}
+"""Loops and branches are recorded with the kernels in them, so that a card goes through them without asking the host.
+
+On an H200 a bounce of one ball takes half the time (270 to 125 µs a step), a car's step 0.63 of it (710 to 445 µs).
 """
 
 
@@ -141,6 +150,56 @@ def splits_vectors() -> bool:
     return not on_cpu() and not jit_is_disabled()
 
 
+# how many steps are a kernel
+
+
+def choose_unrolled_steps(operations: int) -> int:
+    """How many steps of so many operations a turn of a loop takes.
+
+    On a GPU a turn is a launch (10 µs) and takes the state through memory, and a step that reads its neighbours cannot
+    write in place: an even number of steps needs no copy. On a CPU each step more halves the speed: XLA computes the chain
+    of them anew for every array that leaves it.
+    """
+    if on_cpu():
+        return 1
+    fitting = MAX_UNROLLED_OPERATIONS // operations
+    return min(MAX_UNROLLED_STEPS, 2 ** max(1, int(math.log2(max(1, fitting)))))
+
+
+def runs_as_kernel(arrays: Iterable[Any]) -> bool:
+    """Whether the steps of independent lanes between two frames are one kernel: the arrays are all on one GPU.
+
+    Flights by rk4 on an H200, G particle-steps/s, of 65 536, 10⁶ and 10⁷ lanes: in one kernel 5.4, 58 and 160, unrolled
+    by 16 in a loop 5.0, 48 and 131, the plain loop 2.7, 36 and 68 (with 2.4 ms a call on the host, since mended). Balls
+    that bounce at the time of impact, M: in one kernel 3100 and 11 250 (10⁶), in the loop 32.
+    """
+    if device_kind() != "gpu" or jit_is_disabled() or find_spec("jax.experimental.pallas.triton") is None:
+        return False
+    places = {device for array in arrays if isinstance(array, jax.Array) for device in array.devices()}
+    return len(places) <= 1 and all(device.platform == jax.default_backend() for device in places)
+
+
+class KernelShape(NamedTuple):
+    """How many lanes a block of a kernel has, and what Pallas is told."""
+
+    lanes: int
+    options: dict[str, Any]
+
+
+def choose_kernel_shape() -> KernelShape:
+    """A thread for each lane."""
+    return KernelShape(KERNEL_LANES, _build_kernel_options(warps=KERNEL_LANES // 32))
+
+
+def _build_kernel_options(warps: int) -> dict[str, Any]:
+    """What Pallas is told of a kernel: how many warps share a block. On a CPU, as if for a GPU in tests, it is interpreted."""
+    if jax.default_backend() == "cpu":
+        return {"interpret": True}
+    from jax.experimental.pallas import triton
+
+    return {"compiler_params": triton.CompilerParams(num_warps=warps, num_stages=1)}
+
+
 # what is computed once
 
 
@@ -198,7 +257,7 @@ def store_on_any_device(tree: T) -> T:
     return lax.optimization_barrier(tree)
 
 
-def evaluate_coupled(t: ArrayLike, function: Callable[[S], T], state: S) -> T:
+def evaluate_coupled(t: ArrayLike, function: Callable[[PyTree], T], state: PyTree) -> T:
     """`function(state)` of coupled nodes, of which each reads the state of its neighbours, at any finite time t.
 
     Without a store between two evaluations a neighbour's stages would be computed again by all that read it. On a CPU
@@ -235,125 +294,21 @@ def _sort_in_passing(array: Array, number: Int[Array, ""]) -> Array:
     return array * (lax.sort(jnp.stack([number, number + 1]))[0] == number).astype(array.dtype)
 
 
-def bounded_while_loop(going: Callable[[T], Array], body: Callable[[T], T], start: T, *, most: int) -> T:
-    """`lax.while_loop(going, body, start)` with at most `most` turns.
-
-    On a CPU it is compiled in pieces where lanes are few, by a sort of two counters: with many lanes XLA does that by
-    itself. Two rough balls took half a minute to compile while each of their small loops was one function.
-    """
-    few = on_cpu() and max(leaf.size for leaf in jax.tree.leaves(start)) < MIN_LANES_TO_SELECT
-
-    def goes_on(state):
-        return going(state[0]) & (state[1][0] < most)
-
-    def turn(state):
-        carry, count = state
-        return body(carry), lax.sort(count + 1) if few else count + 1
-
-    return lax.while_loop(goes_on, turn, (start, jnp.arange(2, dtype=jnp.int32)))[0]
-
-
-# which lanes are computed
-
-
-def compact_and_apply(
-    function: Callable[..., T],
-    flag: Bool[Array, "*lanes"],
-    changing: T,
-    *others: PyTree,
-    masks: PyTree,
-    cut: bool,
-) -> T:
-    """`function(changing, *others)`, computed only if a lane is flagged; it must leave the other lanes as they are.
-
-    `changing` and what comes back are trees of per-lane arrays; `masks` say of `others` which arrays are. With `cut`, and
-    many lanes, only the flagged ones are gathered, in groups of a fixed size, so that the work follows their number;
-    reverse mode goes through.
-    """
-    lanes, total = flag.shape, flag.size
-    if not cut or total < MIN_LANES_TO_SELECT:
-        return lax.cond(any_lane(flag), lambda: function(changing, *others), lambda: changing)
-    size = math.ceil(total / GROUPS_PER_SCENE)
-    by_lane = lambda leaf: leaf.reshape((total, *leaf.shape[len(lanes) :]))  # noqa: E731
-    flat = jax.tree.map(by_lane, changing)
-    words, upto = _pack_flags(flag.ravel())
-
-    def apply_to_group(now, first):
-        index = _find_flagged_lanes(words, upto, first + jnp.arange(size, dtype=jnp.int32))
-        pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
-        few = jax.tree.map(lambda a, has_lanes: pick(by_lane(a)) if has_lanes else a, others, masks)
-        done = function(jax.tree.map(pick, now), *few)
-        # beyond the last flagged lane there is none, and nothing is written
-        return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop"), now, done)
-
-    def apply_to_groups(now, first):
-        apply = lambda now, first: (  # noqa: E731
-            lax.cond(any_lane(first < upto[-1]), lambda: apply_to_group(now, first), lambda: now),
-            None,
-        )
-        return lax.scan(apply, now, first)[0]
-
-    firsts = jnp.arange(0, total, size, dtype=jnp.int32)
-    end = apply_to_groups(flat, firsts[:1])
-    end = lax.cond(any_lane(upto[-1] > size), lambda: apply_to_groups(end, firsts[1:]), lambda: end)
-    return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
-
-
-def compact_and_apply_runs(
-    function: Callable[..., T], flagged: Callable[..., Bool[Array, "lanes"]], changing: T, *others: PyTree
-) -> T:
-    """`function(changing, *others)`, computed only where `flagged(changing, *others)`, for flags that come in runs.
-
-    `changing` and what comes back are trees of arrays along one axis of lanes; the function must leave other lanes as they
-    are, and clear the flag of those it is for. Windows slide to the next flagged lane until there is none: a slice is
-    copied where the lanes picked by `compact_and_apply` would be gathered and scattered. Reverse mode goes through.
-    """
-    total = len(jax.tree.leaves(changing)[0])
-    if total < MIN_LANES_TO_SELECT:
-        return lax.cond(any_lane(flagged(changing, *others)), lambda: function(changing, *others), lambda: changing)
-    size = math.ceil(total / GROUPS_PER_SCENE)
-
-    def apply_to_window(now):
-        first = jnp.minimum(jnp.argmax(flagged(now, *others)).astype(jnp.int32), total - size)
-        cut = partial(jax.tree.map, lambda leaf: lax.dynamic_slice_in_dim(leaf, first, size))
-        done = function(cut(now), *map(cut, others))
-        return jax.tree.map(lambda a, b: lax.dynamic_update_slice_in_dim(a, b, first, 0), now, done)
-
-    def where_left(go_on, now):
-        return lax.cond(any_lane(flagged(now, *others)), lambda: go_on(now), lambda: now)
-
-    once = partial(where_left, apply_to_window)
-    # the last window is moved back to fit, and so may be one more for lanes that come round to the first
-    rest = lambda now: lax.scan(lambda now, _: (once(now), None), now, length=GROUPS_PER_SCENE)[0]  # noqa: E731
-    return where_left(rest, once(changing))
-
-
-def _pack_flags(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
-    """The flags as words of 32 bits, and how many are set up to and in each word: bit b of word w is lane b·words + w."""
-    length = math.ceil(flag.size / 32)
-    bits = jnp.pad(flag, (0, 32 * length - flag.size)).reshape(32, length).astype(jnp.uint32)
-    words = bits[0]
-    for place in range(1, 32):
-        words = words | (bits[place] << place)
-    return words, jnp.cumsum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
-
-
-def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
-    """The lanes of the flags with these numbers, counted from zero; at least the number of lanes where there are fewer flags."""
-    word = jnp.searchsorted(upto, number + 1, method="scan_unrolled").astype(jnp.int32)
-    left = words.at[word].get(mode="clip")
-    rank = number - upto.at[word].get(mode="clip") + lax.population_count(left).astype(jnp.int32)
-    place = jnp.zeros_like(number)
-    for width in (16, 8, 4, 2, 1):
-        below = lax.population_count(left & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
-        above = rank >= below
-        rank = rank - jnp.where(above, below, 0)
-        place = place + jnp.where(above, width, 0)
-        left = jnp.where(above, left >> width, left)
-    return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
+def compiles_loop_in_pieces(carried: PyTree) -> bool:
+    """Whether a loop needs a sort in it to be compiled in pieces: on a CPU with few lanes; with many XLA does so by itself."""
+    return on_cpu() and max(leaf.size for leaf in jax.tree.leaves(carried)) < MIN_LANES_TO_SELECT
 
 
 # how much is computed at once
+
+
+def choose_group_lanes(lanes: int) -> int | None:
+    """In groups of how many lanes the flagged ones of a scene are computed; None where all lanes are.
+
+    A GPU that is not full takes no longer for all lanes than for one group, and each group is a queue of its own.
+    """
+    size = max(math.ceil(lanes / GROUPS_PER_SCENE), 1 if on_cpu() else MIN_GROUP_LANES_ON_GPU)
+    return None if lanes < MIN_LANES_TO_SELECT or lanes <= 2 * size else size
 
 
 def count_lane_blocks(lanes: int, steps_per_frame: int) -> int | None:
@@ -394,16 +349,14 @@ class PairKernel(NamedTuple):
 
 
 def choose_pair_kernel(bodies: int) -> PairKernel | None:
-    """How a GPU sums over all pairs of bodies in one kernel; None where that is a reduction."""
-    if device_kind() != "gpu" or not PAIRS_IN_KERNEL or bodies < MIN_BODIES_FOR_KERNEL:
+    """How a GPU sums over all pairs of bodies in one kernel; None where that is a reduction.
+
+    In a reduction XLA stores what the components of a pair's pull share: 17 GB for 65 536 bodies without blocks.
+    """
+    if device_kind() != "gpu" or bodies < MIN_BODIES_FOR_KERNEL:
         return None
     shares = max(1, min(PAIR_PROGRAMS * PAIR_TARGETS // bodies, bodies // (4 * PAIR_SOURCES)))
-    if jax.default_backend() == "cpu":  # as if for a GPU, in tests
-        return PairKernel(PAIR_TARGETS, PAIR_SOURCES, shares, {"interpret": True})
-    from jax.experimental.pallas import triton
-
-    options = {"compiler_params": triton.CompilerParams(num_warps=PAIR_WARPS, num_stages=1)}
-    return PairKernel(PAIR_TARGETS, PAIR_SOURCES, shares, options)
+    return PairKernel(PAIR_TARGETS, PAIR_SOURCES, shares, _build_kernel_options(PAIR_WARPS))
 
 
 def choose_tile_sources(bodies: int) -> int:
@@ -424,17 +377,15 @@ def jit_untransformed(
     `many_small_kernels` asks for what compiles those sooner.
     """
     kind = device_kind() if device is None else device.platform
-    if kind != "cpu":
-        return jax.jit(function, **options)
-    wanted = dict(WIDE_VECTOR_OPTIONS)
-    if many_small_kernels and jax.__version_info__ < (0, 11):
-        wanted |= OLDER_EMITTER_OPTIONS
+    wanted: dict[str, int | bool | str] = {"cpu": WIDE_VECTOR_OPTIONS, "gpu": COMMAND_BUFFER_OPTIONS}.get(kind, {})
+    if kind == "cpu" and many_small_kernels and jax.__version_info__ < (0, 11):
+        wanted = wanted | OLDER_EMITTER_OPTIONS
     known = {name: value for name, value in wanted.items() if _is_known_option(name, value)}
     return jax.jit(function, compiler_options=known or None, **options)
 
 
 @functools.cache
-def _is_known_option(name: str, value: int | bool) -> bool:
+def _is_known_option(name: str, value: int | bool | str) -> bool:
     """Whether the compiler takes an option, found once by compiling a program without operations (15 ms)."""
     try:
         probe = jax.jit(lambda x: x, compiler_options={name: value})
@@ -447,27 +398,3 @@ def _is_known_option(name: str, value: int | bool) -> bool:
         )
         return False
     return True
-
-
-# what compiled programs depend on
-
-
-def name_compiler_target() -> str:
-    """What compiled programs depend on, as the name of a folder: jaxlib's version, and the kind and features of the CPU.
-
-    JAX tells the devices of its cache apart by their kind alone, and code for one CPU stops another that lacks an
-    instruction.
-    """
-    features = hashlib.sha256(_read_cpu_features().encode()).hexdigest()[:12]
-    return f"jaxlib-{version('jaxlib')}-{platform.machine()}-{features}"
-
-
-def _read_cpu_features() -> str:
-    """The model and instruction sets of the first CPU, where Linux lists them; elsewhere the name that the system gives it."""
-    listed = Path("/proc/cpuinfo")
-    if not listed.exists():
-        return platform.processor()
-    first = listed.read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
-    return "\n".join(
-        line for line in first if line.split(":")[0].strip() in ("model name", "flags", "Features", "CPU part")
-    )

@@ -48,7 +48,7 @@ def as_real_array(name: str, value: object) -> Array:
     return array
 
 
-def demand_all(name: str, array: Array, good: ArrayLike, expected: str) -> None:
+def demand_all(name: str, array: Array | np.ndarray, good: ArrayLike, expected: str) -> None:
     """Raise a ValueError naming the first offending entry unless all of `good` holds."""
     if np.all(good):
         return
@@ -86,6 +86,19 @@ def as_real_quantity(
     elif at_most is not None:
         demand_all(name, array, values <= at_most, f"numbers <= {at_most:g}")
     return array
+
+
+def as_real_argument(name: str, value: object, dtype: np.dtype, *, above: float) -> Array | np.ndarray:
+    """A finite real array of a type, for a compiled call: on the host where it was given there.
+
+    To look at a number that is on a GPU, and to convert it there, takes longer than a short run.
+    """
+    if isinstance(value, int | float | np.ndarray | np.generic) and np.asarray(value).dtype.kind in "iuf":
+        array = np.asarray(value)
+        demand_all(name, array, np.isfinite(array), "finite numbers (no NaN or infinity)")
+        demand_all(name, array, array > above, f"numbers > {above:g}")
+        return array.astype(dtype)
+    return as_real_quantity(name, value, above=above).astype(dtype)
 
 
 def demand_direction(name: str, vector: Array) -> None:

@@ -1,19 +1,21 @@
 """What is said while a program compiles, and where compiled programs are kept from one session to the next."""
 
+import hashlib
 import os
+import platform
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from physjax.backend import name_compiler_target
 from physjax.files import ensure_writable_folder
 
 QUIET_SECONDS = 1.0
@@ -226,3 +228,24 @@ SETTINGS = (
 FOREVER_SECONDS = 1e9
 """No program takes this long to compile, so none is written."""
 _settings_before: dict[str, object] = {}
+
+
+def name_compiler_target() -> str:
+    """What compiled programs depend on, as the name of a folder: jaxlib's version, and the kind and features of the CPU.
+
+    JAX tells the devices of its cache apart by their kind alone, and code for one CPU stops another that lacks an
+    instruction.
+    """
+    features = hashlib.sha256(_read_cpu_features().encode()).hexdigest()[:12]
+    return f"jaxlib-{version('jaxlib')}-{platform.machine()}-{features}"
+
+
+def _read_cpu_features() -> str:
+    """The model and instruction sets of the first CPU, where Linux lists them; elsewhere the name that the system gives it."""
+    listed = Path("/proc/cpuinfo")
+    if not listed.exists():
+        return platform.processor()
+    first = listed.read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
+    return "\n".join(
+        line for line in first if line.split(":")[0].strip() in ("model name", "flags", "Features", "CPU part")
+    )

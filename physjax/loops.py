@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial, reduce
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -12,8 +13,10 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.backend import jit_is_disabled
+from physjax.backend import compiles_loop_in_pieces, jit_is_disabled
 
+T = TypeVar("T")
+"""What a loop carries."""
 LAST_STEP = 2**31 - 1
 """The highest number that a step can have: steps are counted in 32 bits."""
 LARGEST_SNAP_SHARE = 1 / 64
@@ -206,8 +209,11 @@ def _split_in_two(number: Array) -> tuple[Array, Array]:
     return first, number - first
 
 
-def repeat_steps(step: Callable, carry: PyTree, first: Array, count: int) -> PyTree:
-    """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints."""
+def repeat_steps(step: Callable, carry: PyTree, first: Array, count: int, *, unrolled: int = 1) -> PyTree:
+    """`step(i, carry)` for `count` steps from `first` on, in nested scans: reverse mode replays from √count checkpoints.
+
+    A turn of the loop takes `unrolled` steps.
+    """
     if count == 1:
         return step(first, carry)
     if jit_is_disabled():  # a checkpoint traces in any case, and would hide the numbers from a debugger
@@ -216,13 +222,41 @@ def repeat_steps(step: Callable, carry: PyTree, first: Array, count: int) -> PyT
     outer, rest = divmod(count, inner)
 
     def run(carry, first, length):
-        return lax.scan(lambda c, i: (step(first + i, c), None), carry, jnp.arange(length, dtype=jnp.int32))[0]
+        numbers = jnp.arange(length, dtype=jnp.int32)
+        return lax.scan(
+            lambda c, i: (step(first + i, c), None), carry, numbers, unroll=_fit_unrolled(unrolled, length)
+        )[0]
 
     if outer == 1 and not rest:
         return run(carry, first, count)
     chunk = jax.checkpoint(partial(run, length=inner), prevent_cse=False)
     carry, _ = lax.scan(lambda c, i: (chunk(c, first + i * inner), None), carry, jnp.arange(outer, dtype=jnp.int32))
     return run(carry, first + outer * inner, rest) if rest else carry
+
+
+def bounded_while_loop(going: Callable[[T], Array], body: Callable[[T], T], start: T, *, most: int) -> T:
+    """`lax.while_loop(going, body, start)` with at most `most` turns.
+
+    It is compiled in pieces by a sort of two counters: two rough balls took half a minute to compile while each of their
+    small loops was one function.
+    """
+    few = compiles_loop_in_pieces(start)
+
+    def goes_on(state):
+        return going(state[0]) & (state[1][0] < most)
+
+    def turn(state):
+        carry, count = state
+        return body(carry), lax.sort(count + 1) if few else count + 1
+
+    return lax.while_loop(goes_on, turn, (start, jnp.arange(2, dtype=jnp.int32)))[0]
+
+
+def _fit_unrolled(unrolled: int, length: int) -> int:
+    """About as many steps a turn, such that no turn is left over where that is possible: it would be compiled as well."""
+    unrolled = min(unrolled, length)
+    fitting = max(steps for steps in range(1, unrolled + 1) if length % steps == 0)
+    return fitting if 2 * fitting >= unrolled else unrolled
 
 
 def _choose_chunk_length(count: int) -> int:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import get_opaque_trace_state
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
@@ -55,9 +56,14 @@ def holds_user_code(part: PyTree) -> bool:
     return any(holds_user_code(child) for child in children if child is not part)
 
 
+with jax.ensure_compile_time_eval():
+    _EAGER = get_opaque_trace_state()
+    """What JAX calls the state of tracing where no transformation is around."""
+
+
 def is_untransformed(run: PyTree) -> bool:
     """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
-    traced = any(isinstance(leaf, Tracer) for leaf in (*jax.tree.leaves(run), jnp.zeros(())))
+    traced = get_opaque_trace_state() != _EAGER or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(run))
     return not traced and not holds_user_code(run)
 
 

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from physjax.backend import any_lane, bounded_while_loop, materialise_where
+from physjax.backend import any_lane, materialise_where
+from physjax.loops import bounded_while_loop
 
 
 class Bracket(NamedTuple):

@@ -7,6 +7,9 @@ from typing import Any
 
 from physjax.backend import describe_device
 
+BYTE_UNITS = ("B", "kB", "MB", "GB", "TB", "PB")
+"""Each a thousand of the one before."""
+
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[str]], *, align: str | None = None) -> str:
     """Columns aligned by `align`, a `<` or `>` for each; the first to the left and the others to the right by default."""
@@ -35,6 +38,12 @@ def format_seconds(seconds: int | float) -> str:
         if float(f"{seconds / size:.3g}") >= 1:  # as it is printed
             return f"{seconds / size:.3g} {unit}"
     return f"{seconds / 1e-6:.3g} µs"
+
+
+def format_bytes(count: int) -> str:
+    """An amount of memory with three digits, e.g. "4.8 TB"."""
+    power = min(max(0, (len(str(count)) - 1) // 3), len(BYTE_UNITS) - 1)
+    return f"{count / 1000**power:.3g} {BYTE_UNITS[power]}"
 
 
 def describe_machine() -> str:

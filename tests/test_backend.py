@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from physjax import Particles, Scene, backend, forces, methods, simulate
+from physjax import Particles, Scene, backend, compaction, forces, loops, methods, simulate
 from physjax.backend import (
     LANES_PER_BLOCK,
     MAX_BATCH_LANES,
@@ -99,13 +100,41 @@ def test_only_many_coupled_nodes_are_split():
 @pytest.mark.parametrize("lanes", [3, MANY])
 def test_a_loop_ends_by_its_condition_or_by_its_bound(lanes):
     def run(most):
-        return backend.bounded_while_loop(lambda x: jnp.any(x < 10), lambda x: x + 1, jnp.arange(lanes), most=most)
+        return loops.bounded_while_loop(lambda x: jnp.any(x < 10), lambda x: x + 1, jnp.arange(lanes), most=most)
 
     np.testing.assert_array_equal(run(4), np.arange(lanes) + 4)
     np.testing.assert_array_equal(run(100), np.arange(lanes) + 10)
 
 
+@pytest.mark.parametrize("count", [1, 6, 16, 17, 50, 200])
+@pytest.mark.parametrize("unrolled", [2, 4, 16])
+def test_several_steps_a_turn_are_the_same_steps(count, unrolled):
+    step = lambda i, x: 0.9 * x + i.astype(x.dtype)  # noqa: E731
+    start, first = jnp.asarray(1.0), jnp.int32(3)
+    wanted, slope = jax.value_and_grad(loops.repeat_steps, argnums=1)(step, start, first, count)
+    found, other = jax.value_and_grad(partial(loops.repeat_steps, unrolled=unrolled), argnums=1)(
+        step, start, first, count
+    )
+    assert found == wanted
+    np.testing.assert_allclose(other, slope, rtol=1e-12)
+
+
+def test_a_turn_takes_several_steps_where_each_is_a_launch(elsewhere):
+    steps = [backend.choose_unrolled_steps(operations) for operations in (10, 150, 300, 700, 10_000)]
+    assert steps == [16, 16, 8, 2, 2]  # an even number, so that none needs a copy of what it reads
+
+
+def test_on_a_cpu_a_turn_takes_one_step():
+    if jax.default_backend() == "cpu":
+        assert backend.choose_unrolled_steps(10) == 1
+
+
 # which lanes are computed
+
+
+def test_a_card_is_filled_before_lanes_are_picked(elsewhere):
+    assert backend.choose_group_lanes(100_000) is None
+    assert backend.choose_group_lanes(1_000_000) == 65_536
 
 
 def halve(state, divisor):
@@ -122,7 +151,7 @@ def test_the_flagged_lanes_are_computed_and_no_others(shape, flagged):
         flag.flat[-1] = True
     state = {"x": jnp.asarray(rng.normal(size=(*shape, 2))), "n": jnp.asarray(rng.normal(size=shape))}
     divisor = jnp.where(jnp.asarray(flag), 2.0, 1.0)
-    found = backend.compact_and_apply(halve, jnp.asarray(flag), state, divisor, masks=(True,), cut=True)
+    found = compaction.compact_and_apply(halve, jnp.asarray(flag), state, divisor, masks=(True,), cut=True)
     for name, leaf in halve(state, divisor).items():
         np.testing.assert_array_equal(found[name], leaf)
 
@@ -132,7 +161,7 @@ def test_derivatives_go_through_the_flagged_lanes():
     divisor = jnp.where(flag, 2.0, 1.0)
 
     def cost(x):
-        return jnp.sum(backend.compact_and_apply(halve, flag, x, divisor, masks=(True,), cut=True) ** 2)
+        return jnp.sum(compaction.compact_and_apply(halve, flag, x, divisor, masks=(True,), cut=True) ** 2)
 
     x = jnp.linspace(-1.0, 1.0, MANY)
     np.testing.assert_allclose(jax.grad(cost)(x), 2 * x / divisor**2, rtol=1e-12)
@@ -145,7 +174,7 @@ def test_a_run_of_flags_is_cleared_wherever_it_begins_and_comes_round(lanes, run
     flag = (np.arange(lanes) - first) % lanes < length * lanes // 50
     birth = lambda state, age: {"age": jnp.where(state["age"] < 0, age, state["age"])}  # noqa: E731
     state, age = {"age": jnp.where(flag, -1.0, 1.0)}, jnp.arange(lanes, dtype=float)
-    found = backend.compact_and_apply_runs(birth, lambda state, age: state["age"] < 0, state, age)
+    found = compaction.compact_and_apply_runs(birth, lambda state, age: state["age"] < 0, state, age)
     np.testing.assert_array_equal(found["age"], np.where(flag, age, 1.0))
 
 

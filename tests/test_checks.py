@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from physjax.checks import (
     as_positive_integer,
+    as_real_argument,
     as_real_array,
     as_real_quantity,
     concrete_or_none,
@@ -93,6 +94,24 @@ def test_bounds_hold_strictly_or_not_as_they_say(value):
         else:
             with pytest.raises(ValueError, match=rf"x: got .*, expected numbers {words}"):
                 as_real_quantity("x", value, **options)
+
+
+def test_an_argument_stays_where_it_was_given():
+    for value in (2, 0.5, np.float32(0.5), np.array([1, 2])):
+        found = as_real_argument("dt", value, np.dtype(np.float32), above=0.0)
+        assert isinstance(found, np.ndarray)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, value)
+    assert isinstance(as_real_argument("dt", jnp.ones(2), np.dtype(np.float32), above=0.0), jax.Array)
+    for bad, error, words in (
+        (0.0, ValueError, r"dt: got 0\.0, expected numbers > 0"),
+        (np.nan, ValueError, "dt: got nan, expected finite numbers"),
+        (np.array([1.0, -1.0]), ValueError, r"dt: got -1\.0 at index 1"),
+        (True, TypeError, "dt: got dtype bool, expected real"),
+        ("x", TypeError, "dt: got .*, expected real numbers"),
+    ):
+        with pytest.raises(error, match=words):
+            as_real_argument("dt", bad, np.dtype(np.float32), above=0.0)
 
 
 def test_values_are_not_looked_at_while_they_are_traced_but_types_are():

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from physjax.backend import name_compiler_target
 from physjax.cli import main
 from physjax.cli.chart import _choose_scenes
+from physjax.compiling import name_compiler_target
 from physjax.stepping.methods import METHODS
 
 

@@ -13,8 +13,7 @@ import pytest
 import tqdm
 from jupyter_client.manager import start_new_kernel
 
-import physjax
-from physjax import Particles, Scene, backend, cache, compiling, forces, methods, simulate
+from physjax import Particles, Scene, cache, compiling, forces, methods, simulate
 from physjax.compiling import announce_compiling
 from physjax.scenes import SCENES
 
@@ -242,13 +241,13 @@ def test_programs_are_kept_and_read(tmp_path):
 
 
 def test_each_compiler_and_each_cpu_has_a_folder_of_its_own(monkeypatch):
-    here = backend.name_compiler_target()
-    assert here == backend.name_compiler_target()
-    assert physjax.backend.version("jaxlib") in here
-    monkeypatch.setattr(backend, "_read_cpu_features", lambda: "flags: fpu sse")
-    assert backend.name_compiler_target() != here
-    monkeypatch.setattr(backend, "version", lambda package: "0.9.9")
-    assert backend.name_compiler_target().startswith("jaxlib-0.9.9-")
+    here = compiling.name_compiler_target()
+    assert here == compiling.name_compiler_target()
+    assert compiling.version("jaxlib") in here
+    monkeypatch.setattr(compiling, "_read_cpu_features", lambda: "flags: fpu sse")
+    assert compiling.name_compiler_target() != here
+    monkeypatch.setattr(compiling, "version", lambda package: "0.9.9")
+    assert compiling.name_compiler_target().startswith("jaxlib-0.9.9-")
 
 
 @pytest.mark.usefixtures("uncached")

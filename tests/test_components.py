@@ -19,6 +19,7 @@ from physjax.stepping.methods import METHODS
 from physjax.vectors import cross, dot, norm, scale, spin, square_root, turn_left, unit
 
 loop = importlib.import_module("physjax.stepping.simulate")
+frames = importlib.import_module("physjax.stepping.frames")
 
 
 def split_all(tree):
@@ -195,7 +196,7 @@ def test_a_rule_does_not_see_what_does_not_move():
 
 def run(monkeypatch, split, scene, method, steps=2, dt=0.05):
     """The states of a run whose vectors are split or not; the policy is not asked."""
-    monkeypatch.setattr(loop, "splits_vectors", lambda: split)
+    monkeypatch.setattr(frames, "splits_vectors", lambda: split)
     dt = jnp.asarray(dt, scene.state.dtype)
     return loop._run_steps(scene, as_module(method), dt, jnp.int32(0), 1, steps, None).state
 
@@ -327,7 +328,7 @@ def test_frames_are_whole_again(way, monkeypatch):
     record = (lambda t, state: (t, state.position)) if way == "a record" else None
 
     def frames(scene, split):
-        monkeypatch.setattr(loop, "splits_vectors", lambda: split)
+        monkeypatch.setattr("physjax.stepping.frames.splits_vectors", lambda: split)
         flight = loop._run_steps(scene, as_module(methods.midpoint), jnp.asarray(0.05), jnp.int32(0), 3, 2, record)
         return flight.recorded if record else flight.state, flight.final_scene.state
 

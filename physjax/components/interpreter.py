@@ -1,10 +1,10 @@
 """A program computed by components: its equations one after the other, each by its rule, whole where there is none."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-from jax.extend.core import Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import PyTree
 
 from physjax.components.array_rules import ARRAY_RULES
@@ -81,7 +81,18 @@ class SplittingInterpreter:
         return SplitProgram(lambda *stored: after.unflatten(program(*jax.tree.leaves(stored))), tuple(made))
 
 
-def compute_by_components(function: Callable[..., PyTree], *examples: PyTree, like: PyTree) -> Callable[..., PyTree]:
+class SplitFunction(NamedTuple):
+    """A function of split trees, and the program of the one of whole arrays that it came from."""
+
+    program: ClosedJaxpr
+    call: Callable[..., PyTree]
+
+    def __call__(self, *trees: PyTree) -> PyTree:
+        """Its result."""
+        return self.call(*trees)
+
+
+def compute_by_components(function: Callable[..., PyTree], *examples: PyTree, like: PyTree) -> SplitFunction:
     """A function of trees of arrays as one of trees whose vectors are split, as in the examples; its result is split `like` that.
 
     The function is traced once, here, with whole arrays; what it closes over is a constant.
@@ -97,4 +108,4 @@ def compute_by_components(function: Callable[..., PyTree], *examples: PyTree, li
         found = interpreter.run(closed.jaxpr, closed.consts, ins)
         return structure.unflatten([store_result(v, split) for v, split in zip(found, wanted, strict=True)])
 
-    return by_components
+    return SplitFunction(closed, by_components)

@@ -114,7 +114,7 @@ def apply_loop(run: Interpreter, eqn: JaxprEqn, ins: list[Value]) -> Results:
     if not any(value.is_vector for value in ins):
         return None
     params = eqn.params
-    constant_count, carry_count = _read_scan_layout(params)
+    constant_count, carry_count = read_scan_layout(params)
     end = constant_count + carry_count
     constants = [store_value(value) for value in ins[:constant_count]]
     carry = ins[constant_count:end]
@@ -131,7 +131,7 @@ def apply_loop(run: Interpreter, eqn: JaxprEqn, ins: list[Value]) -> Results:
     return _restore([*last, *kept])
 
 
-def _read_scan_layout(params: dict[str, Any]) -> tuple[int, int]:
+def read_scan_layout(params: dict[str, Any]) -> tuple[int, int]:
     """How many operands of a scan are constants and how many are carried, from the parameters of its equation."""
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]

@@ -19,15 +19,15 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import jit_untransformed, split_compilation, splits_vectors
-from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
+from physjax.backend import jit_untransformed, runs_as_kernel, split_compilation
+from physjax.checks import as_positive_integer, as_real_argument, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
-from physjax.components import compute_by_components, forget_wholes, join_vectors, split_vectors
-from physjax.loops import LAST_STEP, moment_at, repeat_steps, time_at
+from physjax.loops import LAST_STEP, moment_at, time_at
+from physjax.memory import demand_memory_for_frames
 from physjax.parts import as_module, find_plain_functions, is_untransformed
 from physjax.scene import Scene
-from physjax.stepping.blocks import Blocks
+from physjax.stepping.frames import choose_steps
 from physjax.trajectory import Trajectory, select_stateful_parts
 
 
@@ -50,8 +50,8 @@ def simulate(
     `scene.status_shape`. Frame 0 is the start. `record=f(t, state)` keeps only that instead of the whole state; name
     the function once, a new one recompiles. `first_step` continues the count of time: `simulate(flight.final_scene,
     ..., first_step=flight.final_step)` resumes a run, up to step 2³¹ - 1. Under jit, vmap, jvp and grad as well. Raises
-    ValueError or TypeError for bad numbers; a run that blows up does not raise, it returns with `.ok` False and
-    `.first_bad_step`.
+    ValueError or TypeError for bad numbers, MemoryError for frames that cannot fit; a run that blows up does not raise, it
+    returns with `.ok` False and `.first_bad_step`.
 
     JAX keeps the compiled program of every scene that differs in more than numbers, some megabytes each; where there
     are thousands in one process, `jax.clear_caches()` frees them.
@@ -79,8 +79,13 @@ def simulate(
     method = as_module(method)
     warn_of_recompilation("simulate", (*(plain.function for plain in find_plain_functions((scene, method))), record))
     first_step, dt = _check_first_step(first_step, steps, dt)
-    alone = record is None and is_untransformed((scene, method, dt, first_step))
-    run = _get_standalone_run(scene.compile_bound) if alone else _run_inside
+    if record is None:
+        demand_memory_for_frames(scene.state, steps, save_every)
+    given = scene, method, dt, first_step
+    if record is None and is_untransformed(given):
+        run = _get_standalone_run(scene.compile_bound, runs_as_kernel(jax.tree.leaves(given)))
+    else:
+        run = _run_inside
     return run(scene, method, dt, first_step, steps // save_every, save_every, record)
 
 
@@ -92,6 +97,8 @@ def _run_steps(
     frames: int,
     save_every: int,
     record: Callable | None,
+    *,
+    in_kernel: bool = False,
 ) -> Trajectory:
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
     changing = scene.changing()
@@ -101,34 +108,17 @@ def _run_steps(
     def step(i: Array, moving: PyTree, still: PyTree, dt: Array) -> PyTree:
         return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
 
-    blocks = Blocks.of(scene, moving, frame_steps=save_every) if record is None else None
-    prepare = partial(_prepare_steps, step, scene.build_vector_mask((moving, still)) if splits_vectors() else None)
+    way = choose_steps(scene, step, moving, still, dt, frame_steps=save_every, cut=record is None, in_kernel=in_kernel)
 
-    def step_block(moving: PyTree, still: PyTree, dt: Array, first: Array) -> PyTree:
-        advance, start = prepare(moving, still, dt)
-        return join_vectors(repeat_steps(advance, start, first, save_every))
-
-    if blocks is None:
-        advance, start = prepare(moving, still, dt)
-        step_all = lambda moving, first: repeat_steps(advance, moving, first, save_every)  # noqa: E731
-    else:
-        start, lanes = blocks.cut(moving), scene.build_lane_mask((still, dt))
-        step_all = lambda moving, first: blocks.map(  # noqa: E731
-            partial(step_block, first=first), moving, still, dt, masks=lanes
-        )
-
-    def frame(moving: PyTree, index: Array) -> tuple[PyTree, PyTree]:
+    def frame(carried: PyTree, index: Array) -> tuple[PyTree, PyTree]:
         first = first_step + index * save_every
-        moving = step_all(moving, first)
+        carried = way.advance(carried, first, save_every)
         if record is None:
-            return moving, moving
-        return moving, record(clock(first + save_every), eqx.combine(join_vectors(moving), still).state)
+            return carried, carried
+        return carried, record(clock(first + save_every), eqx.combine(way.join(carried), still).state)
 
-    last, kept = lax.scan(frame, start, jnp.arange(frames, dtype=jnp.int32))
-    if blocks is None:
-        last, kept = join_vectors(last), join_vectors(kept) if record is None else kept
-    else:
-        last, kept = blocks.join(last), blocks.join(kept, leading=1)
+    last, kept = lax.scan(frame, way.start(moving), jnp.arange(frames, dtype=jnp.int32))
+    last, kept = way.join(last), way.join(kept, leading=1) if record is None else kept
     first_kept = moving if record is None else record(clock(first_step), scene.state)
     kept = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first_kept, kept)
     film = None if record is not None else eqx.combine(kept, still)
@@ -149,29 +139,16 @@ def _run_steps(
     )
 
 
-def _prepare_steps(
-    step: Callable, vectors: tuple[PyTree, PyTree] | None, moving: PyTree, still: PyTree, dt: Array
-) -> tuple[Callable, PyTree]:
-    """A step `(number, moving) -> moving` and what it starts from: split into components where masks of vectors are given.
-
-    What does not change is split here, before the loop.
-    """
-    if vectors is None:
-        return partial(step, still=still, dt=dt), moving
-    start, still = forget_wholes(split_vectors(moving, vectors[0])), split_vectors(still, vectors[1])
-    by_components = compute_by_components(step, jnp.zeros((), jnp.int32), start, still, dt, like=start)
-    return lambda i, moving: by_components(i, moving, still, dt), start
-
-
 RUN_STRUCTURE = ("frames", "save_every", "record")
 """What of a run is structure and not numbers."""
 _run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
 
 
 @functools.cache
-def _get_standalone_run(compile_bound: bool) -> Callable[..., Trajectory]:
+def _get_standalone_run(compile_bound: bool, in_kernel: bool) -> Callable[..., Trajectory]:
     """The compiled run where no transformation is around it; made at the first run, since it asks for the device."""
-    return jit_untransformed(_run_steps, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
+    run = partial(_run_steps, in_kernel=in_kernel)
+    return jit_untransformed(run, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
 
 
 def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
@@ -238,7 +215,9 @@ def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: Arra
     return StateAfter(end, steps, dt, scene.finite(end))
 
 
-def _check_first_step(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Array, Array]:
+def _check_first_step(
+    first_step: ArrayLike, steps: int, dt: Array | np.ndarray
+) -> tuple[ArrayLike, Array | np.ndarray]:
     """The first step in 32 bits; the last must fit as well, or time would run backwards: a traced one makes dt NaN."""
     number = concrete_or_none(first_step)
     if number is not None and number.size and number.max() > LAST_STEP - steps:
@@ -246,12 +225,16 @@ def _check_first_step(first_step: ArrayLike, steps: int, dt: Array) -> tuple[Arr
             f"first_step: got {number.max()} and {steps} steps, expected at most {LAST_STEP} together: steps are counted in "
             "32 bits. Take longer steps, or begin a new count: first_step=0, with what follows the clock moved by as much."
         )
-    fits = True if number is not None else jnp.asarray(first_step) <= LAST_STEP - steps
-    return jnp.asarray(first_step, jnp.int32), dt if fits is True else jnp.where(fits, dt, jnp.nan)
+    if number is not None:
+        return number.astype(np.int32), dt
+    return jnp.asarray(first_step, jnp.int32), jnp.where(jnp.asarray(first_step) <= LAST_STEP - steps, dt, jnp.nan)
 
 
-def _check_dt(dt: ArrayLike, scene: Scene) -> Array:
-    dt = _invalidate_nonpositive(as_real_quantity("dt [s]", dt, above=0.0).astype(scene.state.dtype))
+def _check_dt(dt: ArrayLike, scene: Scene) -> Array | np.ndarray:
+    """The step [s] in the scene's type; on the host where it was given there, from where the compiled run takes it."""
+    dt = as_real_argument("dt [s]", dt, scene.state.dtype, above=0.0)
+    if isinstance(dt, Tracer):
+        dt = _invalidate_nonpositive(dt)
     if dt.shape not in ((), scene.status_shape):
         raise ValueError(
             f"dt [s]: got shape {dt.shape}, expected () or {scene.status_shape}: one step size per "

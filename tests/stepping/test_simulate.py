@@ -13,11 +13,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from physjax import Particles, Scene, contacts, forces, lattices, methods, simulate
+from physjax import Particles, Scene, contacts, forces, lattices, memory, methods, simulate
 from physjax.parts import Force
 from physjax.physics.forces import independent
 from physjax.stepping.methods import METHODS
 from physjax.stepping.simulate import state_after
+from physjax.text import format_bytes
 
 MASS = np.array([0.2, 0.5, 1.0, 2.0, 4.0])
 
@@ -457,3 +458,25 @@ def test_a_function_that_stays_and_one_inside_of_jit_are_not_told():
             throw(gust_of_wind)
             throw(fan.blow)
         jax.jit(lambda: [throw(partial(lambda k, t, s, m: -k * s.velocity, k)).position for k in (1.0, 2.0)])()
+
+
+def test_frames_that_cannot_fit_are_refused_before_anything_is_computed(monkeypatch):
+    monkeypatch.setattr("physjax.memory.read_memory_limit", lambda: 10_000)
+    drop = Scene(Particles(jnp.zeros((10, 3)), jnp.zeros((10, 3))), forces=(forces.Gravity(),))
+    kind = drop.state.dtype.itemsize
+    frame = 2 * 60 * kind
+    fitting = 10_000 // frame - 1
+    with pytest.raises(
+        MemoryError, match=rf"got 401 frames of .*expected at most 10 kB.*save_every={-(-400 // fitting)} or more"
+    ):
+        simulate(drop, methods.rk4, dt=0.1, steps=400)
+    assert simulate(drop, methods.rk4, dt=0.1, steps=400, save_every=100).ok.all()
+    assert simulate(
+        drop, methods.rk4, dt=0.1, steps=400, record=lambda t, state: state.position[0, 1]
+    ).recorded.shape == (401,)
+
+
+def test_the_memory_of_this_machine_is_known_or_said_to_be_unknown():
+    limit = memory.read_memory_limit()
+    assert limit is None or limit > 2**28
+    assert [format_bytes(n) for n in (0, 999, 48_000, 4_800_000_000_000)] == ["0 B", "999 B", "48 kB", "4.8 TB"]

@@ -13,8 +13,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from physjax.backend import any_lane, bounded_while_loop
-from physjax.loops import Time, to_float_time
+from physjax.backend import any_lane
+from physjax.loops import Time, bounded_while_loop, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.resting import Reaction
 from physjax.physics.contacts.surfaces import Surfaces, Touch, mask_surfaces, relative_to

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.backend import any_lane, bounded_while_loop
+from physjax.backend import any_lane
 from physjax.cubics import Cubic
+from physjax.loops import bounded_while_loop
 from physjax.particles import Particles
 from physjax.physics.contacts.face import Face, LowestPoint
 from physjax.vectors import norm, scale

@@ -13,8 +13,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int
 
-from physjax.backend import any_lane, bounded_while_loop, materialise_where
-from physjax.loops import Time, to_float_time
+from physjax.backend import any_lane, materialise_where
+from physjax.loops import Time, bounded_while_loop, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.contact_mode import (
     ContactMode,

@@ -14,7 +14,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
-from physjax.backend import MIN_LANES_TO_SELECT, any_lane, compact_and_apply, materialise_where
+from physjax.backend import MIN_LANES_TO_SELECT, any_lane, materialise_where
+from physjax.compaction import compact_and_apply
 from physjax.loops import Time, to_float_time
 from physjax.particles import Particles
 from physjax.parts import holds_user_code

@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import compact_and_apply_runs, materialise
+from physjax.backend import materialise
 from physjax.checks import (
     Numbers,
     OptionalNumbers,
@@ -28,6 +28,7 @@ from physjax.checks import (
     quantity,
     unchecked_quantity,
 )
+from physjax.compaction import compact_and_apply_runs
 from physjax.loops import (
     LARGEST_SNAP_SHARE,
     Moment,

@@ -14,8 +14,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int
 
-from physjax.backend import any_lane, bounded_while_loop, materialise_where
-from physjax.loops import Time
+from physjax.backend import any_lane, materialise_where
+from physjax.loops import Time, bounded_while_loop
 from physjax.particles import Particles
 from physjax.physics.contacts.events import Dip
 from physjax.physics.contacts.legs import MAX_DIFFERENTIATED_IMPACTS, Motion, choose_lanes, shortest_duration

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from physjax.backend import any_lane, bounded_while_loop
+from physjax.backend import any_lane
+from physjax.loops import bounded_while_loop
 from physjax.vectors import norm
 
 MAX_SWEEPS = 256

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.backend import any_lane, bounded_while_loop, compact_and_apply
+from physjax.backend import any_lane
+from physjax.compaction import compact_and_apply
 from physjax.linear import solve_columns
-from physjax.loops import RECORD
+from physjax.loops import RECORD, bounded_while_loop
 from physjax.particles import Particles
 from physjax.scene import Scene
 from physjax.stepping.simulate import sample_states, simulate

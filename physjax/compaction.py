@@ -1,0 +1,113 @@
+"""Only the lanes that are flagged are computed, gathered in groups or in windows, so that the work follows their number."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, PyTree
+
+from physjax.backend import GROUPS_PER_SCENE, any_lane, choose_group_lanes
+
+T = TypeVar("T")
+"""A tree of arrays that comes back with the same structure and shapes."""
+
+
+def compact_and_apply(
+    function: Callable[..., T],
+    flag: Bool[Array, "*lanes"],
+    changing: T,
+    *others: PyTree,
+    masks: PyTree,
+    cut: bool,
+) -> T:
+    """`function(changing, *others)`, computed only if a lane is flagged; it must leave the other lanes as they are.
+
+    `changing` and what comes back are trees of per-lane arrays; `masks` say of `others` which arrays are. With `cut`, and
+    many lanes, only the flagged ones are gathered, in groups of a fixed size, so that the work follows their number;
+    reverse mode goes through.
+    """
+    lanes, total = flag.shape, flag.size
+    size = choose_group_lanes(total) if cut else None
+    if size is None:
+        return lax.cond(any_lane(flag), lambda: function(changing, *others), lambda: changing)
+    by_lane = lambda leaf: leaf.reshape((total, *leaf.shape[len(lanes) :]))  # noqa: E731
+    flat = jax.tree.map(by_lane, changing)
+    words, upto = _pack_flags(flag.ravel())
+
+    def apply_to_group(now, first):
+        index = _find_flagged_lanes(words, upto, first + jnp.arange(size, dtype=jnp.int32))
+        pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
+        few = jax.tree.map(lambda a, has_lanes: pick(by_lane(a)) if has_lanes else a, others, masks)
+        done = function(jax.tree.map(pick, now), *few)
+        # beyond the last flagged lane there is none, and nothing is written
+        return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop"), now, done)
+
+    def apply_to_groups(now, first):
+        apply = lambda now, first: (  # noqa: E731
+            lax.cond(any_lane(first < upto[-1]), lambda: apply_to_group(now, first), lambda: now),
+            None,
+        )
+        return lax.scan(apply, now, first)[0]
+
+    firsts = jnp.arange(0, total, size, dtype=jnp.int32)
+    end = apply_to_groups(flat, firsts[:1])
+    end = lax.cond(any_lane(upto[-1] > size), lambda: apply_to_groups(end, firsts[1:]), lambda: end)
+    return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
+
+
+def compact_and_apply_runs(
+    function: Callable[..., T], flagged: Callable[..., Bool[Array, "lanes"]], changing: T, *others: PyTree
+) -> T:
+    """`function(changing, *others)`, computed only where `flagged(changing, *others)`, for flags that come in runs.
+
+    `changing` and what comes back are trees of arrays along one axis of lanes; the function must leave other lanes as they
+    are, and clear the flag of those it is for. Windows slide to the next flagged lane until there is none: a slice is
+    copied where the lanes picked by `compact_and_apply` would be gathered and scattered. Reverse mode goes through.
+    """
+    total = len(jax.tree.leaves(changing)[0])
+    size = choose_group_lanes(total)
+    if size is None:
+        return lax.cond(any_lane(flagged(changing, *others)), lambda: function(changing, *others), lambda: changing)
+
+    def apply_to_window(now):
+        first = jnp.minimum(jnp.argmax(flagged(now, *others)).astype(jnp.int32), total - size)
+        cut = partial(jax.tree.map, lambda leaf: lax.dynamic_slice_in_dim(leaf, first, size))
+        done = function(cut(now), *map(cut, others))
+        return jax.tree.map(lambda a, b: lax.dynamic_update_slice_in_dim(a, b, first, 0), now, done)
+
+    def where_left(go_on, now):
+        return lax.cond(any_lane(flagged(now, *others)), lambda: go_on(now), lambda: now)
+
+    once = partial(where_left, apply_to_window)
+    # the last window is moved back to fit, and so may be one more for lanes that come round to the first
+    rest = lambda now: lax.scan(lambda now, _: (once(now), None), now, length=GROUPS_PER_SCENE)[0]  # noqa: E731
+    return where_left(rest, once(changing))
+
+
+def _pack_flags(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
+    """The flags as words of 32 bits, and how many are set up to and in each word: bit b of word w is lane b·words + w."""
+    length = math.ceil(flag.size / 32)
+    bits = jnp.pad(flag, (0, 32 * length - flag.size)).reshape(32, length).astype(jnp.uint32)
+    words = bits[0]
+    for place in range(1, 32):
+        words = words | (bits[place] << place)
+    return words, jnp.cumsum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
+
+
+def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
+    """The lanes of the flags with these numbers, counted from zero; at least the number of lanes where there are fewer flags."""
+    word = jnp.searchsorted(upto, number + 1, method="scan_unrolled").astype(jnp.int32)
+    left = words.at[word].get(mode="clip")
+    rank = number - upto.at[word].get(mode="clip") + lax.population_count(left).astype(jnp.int32)
+    place = jnp.zeros_like(number)
+    for width in (16, 8, 4, 2, 1):
+        below = lax.population_count(left & jnp.uint32((1 << width) - 1)).astype(jnp.int32)
+        above = rank >= below
+        rank = rank - jnp.where(above, below, 0)
+        place = place + jnp.where(above, width, 0)
+        left = jnp.where(above, left >> width, left)
+    return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
