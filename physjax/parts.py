@@ -62,9 +62,11 @@ with jax.ensure_compile_time_eval():
 
 
 def is_untransformed(run: PyTree) -> bool:
-    """Whether a run is compiled by itself: nothing in it is traced, and no function of the user can hide a tracer."""
-    traced = get_opaque_trace_state() != _EAGER or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(run))
-    return not traced and not holds_user_code(run)
+    """Whether a run is compiled by itself: no transformation is around it, so that nothing in it is traced.
+
+    What a function of the user closes over is not traced either, since there is nothing that would trace it.
+    """
+    return get_opaque_trace_state() == _EAGER and not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(run))
 
 
 def _is_library_definition(definition: Any) -> bool:

@@ -4,6 +4,7 @@ import importlib
 from contextlib import contextmanager
 from unittest import mock
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 from jax import lax
 
 from physjax import Particles, Scene, backend, contacts, forces, inertia, methods, rigid, simulate
+from physjax.checks import quantity
 from physjax.kernels import LaneKernel
+from physjax.parts import Force
 from physjax.programs import iterate_operations
 
 loop = importlib.import_module("physjax.stepping.simulate")
@@ -207,9 +210,35 @@ def test_lanes_that_see_each_other_take_the_loop():
     assert is_run_in_kernels(Scene(throws(float), 1.0, (forces.Gravity(),)))
 
 
-def test_a_force_that_may_know_all_lanes_takes_the_loop():
+class Push(Force):
+    """A force of a user's own, with a number that is declared."""
+
+    strength: jax.Array = quantity("strength", "N")
+
+    def __call__(self, t, state, mass):
+        return self.strength * jnp.ones_like(state.velocity)
+
+
+def test_a_force_of_ones_own_runs_in_a_kernel_unless_it_may_know_all_lanes():
     push = numbers(LANES, 3)
+    assert is_run_in_kernels(Scene(throws(float), 1.0, (Push(2.0),)))
     assert not is_run_in_kernels(Scene(throws(float), 1.0, (lambda t, state, mass: push,)))
+
+
+class Slowed(eqx.Module):
+    """A method whose steps leave a share of the velocity."""
+
+    share: jax.Array
+
+    def __call__(self, system, t, state, dt):
+        end = methods.rk4(system, t, state, dt)
+        return end._replace(velocity=end.velocity * self.share)
+
+
+def test_a_method_with_an_array_takes_the_loop():
+    scene = Scene(throws(float), 1.0, (forces.Gravity(),))
+    assert is_run_in_kernels(scene, Slowed(jnp.asarray(0.9)))
+    assert not is_run_in_kernels(scene, Slowed(jnp.linspace(0.5, 0.9, LANES)[:, None]))
 
 
 def test_a_long_step_takes_the_loop(monkeypatch):

@@ -83,7 +83,9 @@ def simulate(
         demand_memory_for_frames(scene.state, steps, save_every)
     given = scene, method, dt, first_step
     if record is None and is_untransformed(given):
-        run = _get_standalone_run(scene.compile_bound, runs_as_kernel(jax.tree.leaves(given)))
+        # an array of a method may be of all lanes, of which a kernel's step is one
+        in_kernel = runs_as_kernel(jax.tree.leaves(given)) and all(np.ndim(a) == 0 for a in jax.tree.leaves(method))
+        run = _get_standalone_run(scene.compile_bound, in_kernel)
     else:
         run = _run_inside
     return run(scene, method, dt, first_step, steps // save_every, save_every, record)
