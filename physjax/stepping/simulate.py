@@ -94,8 +94,8 @@ def simulate(
 def _run_steps(
     scene: Scene,
     method: Callable,
-    dt: Array,
-    first_step: Array,
+    dt: ArrayLike,
+    first_step: ArrayLike,
     frames: int,
     save_every: int,
     record: Callable | None,
@@ -103,6 +103,7 @@ def _run_steps(
     in_kernel: bool = False,
 ) -> Trajectory:
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
+    dt, first_step = jnp.asarray(dt), jnp.asarray(first_step)  # of the host, where nothing is compiled
     changing = scene.changing()
     moving, still = eqx.partition(scene, changing)
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
