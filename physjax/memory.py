@@ -11,7 +11,7 @@ from physjax.text import format_bytes
 @functools.cache
 def read_memory_limit() -> int | None:
     """The memory of the default device [bytes]: a GPU's as JAX may use it, else the machine's; None if unknown."""
-    known = jax.devices()[0].memory_stats()
+    known = jax.local_devices()[0].memory_stats()  # those of other processes cannot be asked
     if known and "bytes_limit" in known:
         return known["bytes_limit"]
     names = getattr(os, "sysconf_names", {})

@@ -113,7 +113,7 @@ def test_the_legend_has_room_below_the_panels():
 
 
 def test_table_is_aligned():
-    aligned = format_table(["method", "ms"], [["euler", 1], ["semi_implicit_euler", 20]])
+    aligned = format_table(["method", "ms"], [["euler", "1"], ["semi_implicit_euler", "20"]])
     lines = aligned.splitlines()
     assert len({len(line) for line in lines}) == 1
     assert lines[2].startswith("euler ")
