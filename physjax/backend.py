@@ -85,8 +85,8 @@ OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
 From jax 0.11 on there are no others, and the option is gone.
 """
 COMMAND_BUFFER_OPTIONS = {
-    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,WHILE,CONDITIONAL"
-}
+    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUSTOM_CALL,WHILE,CONDITIONAL", "xla_gpu_graph_min_graph_size": 1
+}  # fmt: skip
 """Loops and branches are recorded with the kernels in them, so that a card goes through them without asking the host.
 
 On an H200 a bounce of one ball takes half the time (270 to 125 µs a step), a car's step 0.63 of it (710 to 445 µs).
@@ -169,9 +169,9 @@ def choose_unrolled_steps(operations: int) -> int:
 def runs_as_kernel(arrays: Iterable[Any]) -> bool:
     """Whether the steps of independent lanes between two frames are one kernel: the arrays are all on one GPU.
 
-    Flights by rk4 on an H200, G particle-steps/s, of 65 536, 10⁶ and 10⁷ lanes: in one kernel 5.4, 58 and 160, unrolled
-    by 16 in a loop 5.0, 48 and 131, the plain loop 2.7, 36 and 68 (with 2.4 ms a call on the host, since mended). Balls
-    that bounce at the time of impact, M: in one kernel 3100 and 11 250 (10⁶), in the loop 32.
+    Flights by rk4 on an H200, G particle-steps/s, of 65 536, 10⁶ and 10⁷ lanes: 20, 111 and 177; with 2 ms more a call on the
+    host in one kernel 5.4, 58 and 160, unrolled by 16 in a loop 5.0, 48 and 131, the plain loop 2.7, 36 and 68. Balls that
+    bounce at the time of impact, M: in one kernel 5100 and 10 600 (10⁶), in the loop 32.
     """
     if device_kind() != "gpu" or jit_is_disabled() or find_spec("jax.experimental.pallas.triton") is None:
         return False
