@@ -71,7 +71,7 @@ SPRINGS_AT_BOTH_ENDS = True
 """Whether a GPU computes each spring at both of its ends, or once and stores what both ends read.
 
 At both ends a step is one kernel: for a cloth of six bands 12 roots and 119 reads a node. Once, it is two, with 6 numbers a
-node written and read back between them.
+node between them. G node-steps/s of 128², 512² and 1024² nodes on an H200: 1.4, 12.9, 9.4 and 1.2, 10.6, 11.0.
 """
 PAIR_TARGETS, PAIR_SOURCES, PAIR_WARPS, PAIR_PROGRAMS = 64, 32, 4, 1024
 """Targets and sources in a tile of that kernel, 16 pairs for each thread; warps that share it; how many tiles fill a card."""
@@ -260,8 +260,8 @@ def store_on_any_device(tree: T) -> T:
 def evaluate_coupled(t: ArrayLike, function: Callable[[PyTree], T], state: PyTree) -> T:
     """`function(state)` of coupled nodes, of which each reads the state of its neighbours, at any finite time t.
 
-    Without a store between two evaluations a neighbour's stages would be computed again by all that read it. On a CPU
-    what is found is stored, on a GPU what is read: the state, of which the first of a step is in memory already.
+    Without a store between two evaluations a neighbour's stages would be computed by all that read it. On a CPU what is
+    found is stored, on a GPU the state.
     """
     if on_cpu():
         return materialise(t, lambda: function(state))
