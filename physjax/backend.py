@@ -154,11 +154,11 @@ def splits_vectors() -> bool:
 
 
 def choose_unrolled_steps(operations: int) -> int:
-    """How many steps of so many operations a turn of a loop takes.
+    """How many steps a turn of a loop takes, given the number of operations in a step.
 
     On a GPU a turn is a launch (10 µs) and takes the state through memory, and a step that reads its neighbours cannot
     write in place: an even number of steps needs no copy. On a CPU each step more halves the speed: XLA computes the chain
-    of them anew for every array that leaves it.
+    of them again for every array that leaves it.
     """
     if on_cpu():
         return 1
@@ -180,7 +180,7 @@ def runs_as_kernel(arrays: Iterable[Any]) -> bool:
 
 
 class KernelShape(NamedTuple):
-    """How many lanes a block of a kernel has, and what Pallas is told."""
+    """How many lanes a block of a kernel has, and the options for Pallas."""
 
     lanes: int
     options: dict[str, Any]
@@ -192,7 +192,7 @@ def choose_kernel_shape() -> KernelShape:
 
 
 def _build_kernel_options(warps: int) -> dict[str, Any]:
-    """What Pallas is told of a kernel: how many warps share a block. On a CPU, as if for a GPU in tests, it is interpreted."""
+    """The options for Pallas: how many warps share a block. On a CPU, as if for a GPU in tests, kernels are interpreted."""
     if jax.default_backend() == "cpu":
         return {"interpret": True}
     from jax.experimental.pallas import triton
@@ -340,7 +340,7 @@ def choose_block_targets(bodies: int) -> int | None:
 
 
 class PairKernel(NamedTuple):
-    """Targets and sources in a tile, in how many shares the sources are summed side by side, and what Pallas is told."""
+    """Targets and sources in a tile, in how many shares the sources are summed side by side, and the options for Pallas."""
 
     targets: int
     sources: int

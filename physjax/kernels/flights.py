@@ -122,11 +122,13 @@ class LaneKernel(NamedTuple):
             found = LaneInterpreter(shape.lanes).run(one.jaxpr, constants, ins)
             return flatten_to_vectors(found, carried.kinds, shape.lanes)
 
-        block = lambda columns: [jax.ShapeDtypeStruct((shape.lanes,), c.dtype) for c in columns]  # noqa: E731
+        block = lambda kinds: [jax.ShapeDtypeStruct((shape.lanes,), kind) for kind in kinds]  # noqa: E731
         same = [jax.ShapeDtypeStruct((), number.dtype) for number in (*shared, *closed_over)]
-        begun = block(carried.split(moving)[0])
+        begun = block(
+            kind for kind, rest in zip(carried.kinds, carried.shapes, strict=True) for _ in range(math.prod(rest))
+        )
         try:
-            written = jax.make_jaxpr(take_step)(jnp.zeros((), jnp.int32), begun, block(columns), same)
+            written = jax.make_jaxpr(take_step)(jnp.zeros((), jnp.int32), begun, block(c.dtype for c in columns), same)
         except UnsupportedError:
             return None
         if count_operations(written) > MAX_KERNEL_OPERATIONS:
@@ -142,7 +144,7 @@ class LaneKernel(NamedTuple):
         return self.moving.join(carried)
 
     def advance(self, carried: Sequence[Array], first: Array, count: int) -> list[Array]:
-        """So many steps from number `first` on, in one kernel."""
+        """`count` steps from number `first` on, in one kernel."""
         lanes, moved, own = self.shape.lanes, len(carried), len(self.columns)
         by_lane, single = pl.BlockSpec((lanes,), lambda i: (i,)), pl.BlockSpec((1,), lambda i: (0,))
         step = jaxpr_as_fun(self.step)

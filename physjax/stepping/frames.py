@@ -29,11 +29,11 @@ class Steps(Protocol):
         ...
 
     def advance(self, carried: Any, first: Array, count: int) -> Any:
-        """So many steps from number `first` on."""
+        """`count` steps from number `first` on."""
         ...
 
     def join(self, carried: Any, leading: int = 0) -> PyTree:
-        """The arrays of the scene again, behind so many leading axes."""
+        """The arrays of the scene again, behind `leading` further axes."""
         ...
 
 
