@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.backend import compiles_loop_in_pieces, jit_is_disabled
+from physjax.backend import any_lane, compiles_loop_in_pieces, jit_is_disabled
 
 T = TypeVar("T")
 """What a loop carries."""
@@ -250,6 +251,54 @@ def bounded_while_loop(going: Callable[[T], Array], body: Callable[[T], T], star
         return body(carry), lax.sort(count + 1) if few else count + 1
 
     return lax.while_loop(goes_on, turn, (start, jnp.arange(2, dtype=jnp.int32)))[0]
+
+
+def differentiable_while_loop(going: Callable[[T], Array], turn: Callable[[T], T], start: T, *, most: int) -> T:
+    """`lax.while_loop(going, turn, start)`, with derivatives forward and reverse, of any order.
+
+    `going` has one flag a lane. Where something is differentiated the loop is one over chunks of turns, left out from where
+    no lane is going; reverse mode stores √`most` carries. Derivatives of lanes that need more than `most` turns are NaN.
+    """
+    closed, shape = jax.make_jaxpr(turn, return_shape=True)(start)
+    structure = jax.tree.structure(shape)
+
+    def call(known: list, carry: T) -> T:
+        return structure.unflatten(jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, known))(*jax.tree.leaves(carry)))
+
+    @jax.custom_jvp
+    def run(known: list, start: T) -> T:
+        return lax.while_loop(lambda carry: any_lane(going(carry)), partial(call, known), start)
+
+    @run.defjvp
+    def push(given: tuple, changes: tuple) -> tuple:
+        bounded = lambda known, start: _repeat_while(going, partial(call, known), start, most)  # noqa: E731
+        end, change = jax.jvp(bounded, given, changes)
+        lost = going(end)
+        return end, jax.tree.map(lambda leaf: _invalidate(leaf, lost), change)
+
+    return run(list(closed.consts), start)
+
+
+def _repeat_while(going: Callable, turn: Callable, start: T, most: int) -> T:
+    """At most as many turns in two nested scans, those after the last that is needed left out."""
+    length = math.isqrt(most - 1) + 1
+
+    def go_on(carry: T, turn: Callable) -> T:
+        return lax.cond(any_lane(going(carry)), turn, lambda carry: carry, carry)
+
+    def chunk(carry: T) -> T:
+        return lax.scan(lambda carry, _: (go_on(carry, turn), None), carry, None, length=length)[0]
+
+    chunk = jax.checkpoint(chunk, prevent_cse=False)
+    return lax.scan(lambda carry, _: (go_on(carry, chunk), None), start, None, length=-(-most // length))[0]
+
+
+def _invalidate(leaf: Array | np.ndarray, lost: Array) -> Array | np.ndarray:
+    """The derivative, NaN for lanes that are lost."""
+    if leaf.dtype == jax.dtypes.float0:
+        return leaf
+    kept = jnp.where(lost, jnp.nan, 1.0).astype(leaf.dtype)
+    return leaf * kept.reshape(kept.shape + (1,) * (leaf.ndim - kept.ndim))
 
 
 def _fit_unrolled(unrolled: int, length: int) -> int:
