@@ -8,7 +8,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
 from physjax.backend import GROUPS_PER_SCENE, any_lane, choose_group_lanes
 
@@ -111,3 +111,9 @@ def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
         place = place + jnp.where(above, width, 0)
         left = jnp.where(above, left >> width, left)
     return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
+
+
+def write_entries(table: Array, place: Int[Array, "*lanes"], entries: Array) -> Array:
+    """A table `(length, *lanes, ...)` with an entry of each lane written at a place of its own; beyond its length, none."""
+    lanes = jnp.meshgrid(*map(jnp.arange, place.shape), indexing="ij")
+    return table.at[(place, *lanes)].set(entries, mode="drop", unique_indices=True)

@@ -259,24 +259,38 @@ def differentiable_while_loop(going: Callable[[T], Array], turn: Callable[[T], T
     `going` has one flag a lane. Where something is differentiated the loop is one over chunks of turns, left out from where
     no lane is going; reverse mode stores √`most` carries. Derivatives of lanes that need more than `most` turns are NaN.
     """
-    closed, shape = jax.make_jaxpr(turn, return_shape=True)(start)
-    structure = jax.tree.structure(shape)
-
-    def call(known: list, carry: T) -> T:
-        return structure.unflatten(jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, known))(*jax.tree.leaves(carry)))
+    if jit_is_disabled():  # so that all numbers can be looked at
+        while any_lane(going(start)):
+            start = turn(start)
+        return start
+    # what they close over may be differentiated as well
+    (go, known), (move, closed_over) = _open_closure(going, start), _open_closure(turn, start)
 
     @jax.custom_jvp
-    def run(known: list, start: T) -> T:
-        return lax.while_loop(lambda carry: any_lane(going(carry)), partial(call, known), start)
+    def run(known: list, closed_over: list, start: T) -> T:
+        return lax.while_loop(lambda carry: any_lane(go(known, carry)), partial(move, closed_over), start)
 
     @run.defjvp
     def push(given: tuple, changes: tuple) -> tuple:
-        bounded = lambda known, start: _repeat_while(going, partial(call, known), start, most)  # noqa: E731
+        def bounded(known: list, closed_over: list, start: T) -> T:
+            return _repeat_while(partial(go, known), partial(move, closed_over), start, most)
+
         end, change = jax.jvp(bounded, given, changes)
-        lost = going(end)
+        lost = go(given[0], end)
         return end, jax.tree.map(lambda leaf: _invalidate(leaf, lost), change)
 
-    return run(list(closed.consts), start)
+    return run(known, closed_over, start)
+
+
+def _open_closure(function: Callable[[T], PyTree], example: T) -> tuple[Callable[[list, T], PyTree], list]:
+    """The function with what it closes over as its first argument, and that."""
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(example)
+    structure = jax.tree.structure(shape)
+
+    def opened(known: list, carry: T) -> PyTree:
+        return structure.unflatten(jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, known))(*jax.tree.leaves(carry)))
+
+    return opened, list(closed.consts)
 
 
 def _repeat_while(going: Callable, turn: Callable, start: T, most: int) -> T:

@@ -6,7 +6,7 @@ each leg began and how long it took is logged, so that the derivative of a leg i
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, wraps
 from typing import NamedTuple
 
 import jax
@@ -16,10 +16,23 @@ from jax import lax
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.tree_util import Partial
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, PyTree
 
 from physjax.backend import any_lane
 from physjax.vectors import scale
+
+
+def trace_once(response: Callable) -> Callable:
+    """A response traced once for all callers that step the same scene: a search with derivatives does so in many places."""
+    program = jax.jit(response)
+
+    @wraps(response)
+    def respond(motion: Callable, scene: PyTree, t: PyTree, dt: ArrayLike) -> PyTree:
+        return program(motion if isinstance(motion, Partial) else Partial(motion), scene, t, dt)
+
+    return respond
 
 
 class Replay(NamedTuple):

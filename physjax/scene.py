@@ -8,7 +8,7 @@ unless a force says otherwise.
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial, wraps
+from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -186,6 +186,11 @@ class Scene(eqx.Module):
         return build_vector_mask(tree, self.state.lanes, self.state.position.shape[-1])
 
     @property
+    def only_moves(self) -> bool:
+        """Whether a step is the method's alone: no contact, birth or path within it, and no memory after it."""
+        return not self.contacts and self.emitter is None and self.prescribed_motion is None and not self.remembers
+
+    @property
     def remembers(self) -> bool:
         """Whether a force remembers: springs that break."""
         return any(force.remembers for force in self.forces)
@@ -272,8 +277,11 @@ class Scene(eqx.Module):
 
         "move": the method's step, with what contacts resolve within it (all of them where an emitter gives each
         particle a step of its own); "resolve contacts": each contact that projects; "prescribe": kinematic nodes are
-        put on their path, held ones back in their place; "advance memory": each force with memory.
+        put on their path, held ones back in their place; "advance memory": each force with memory. A method that
+        subdivides the step goes through all of them in each of its own.
         """
+        if isinstance(method, SubdividingMethod) and not self.only_moves and self.emitter is None:
+            return (Stage("move", lambda scene: method.step_scene(scene, t, dt)),)
         emitter, motion = self.emitter, self._motion(method)
         if emitter is None:
             stages = [Stage("move", lambda scene: motion(scene, t, dt))]
@@ -351,33 +359,22 @@ def _advance_force(index: int, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Sce
     return scene.replace(state=after if seen is state else state, forces=forces)
 
 
-def trace_once(response: Callable) -> Callable:
-    """A response traced once for all callers that step the same scene: a search with derivatives does so in many places."""
-    program = jax.jit(response)
-
-    @wraps(response)
-    def respond(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
-        return program(motion if isinstance(motion, Partial) else Partial(motion), scene, t, dt)
-
-    return respond
-
-
 @runtime_checkable
 class SubdividingMethod(Protocol):
     """A method that takes steps of its own within dt, and so asks forces that jump for their mean itself."""
-
-    def check_scene(self, scene: Scene) -> Scene:
-        """The scene as it is stepped; refuses what cannot be subdivided."""
-        ...
 
     def __call__(self, system: Scene, t: Time, state: PyTree, dt: ArrayLike) -> PyTree:
         """The state after dt."""
         ...
 
+    def step_scene(self, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
+        """The scene after dt, all that belongs to a step done in each of its own."""
+        ...
+
 
 def free_motion(method: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """A step of the method as if nothing were in the way; one that subdivides dt asks for what jumps in it by itself."""
-    seen = method.check_scene(scene) if isinstance(method, SubdividingMethod) else scene.averaged_over_step(t, dt)
+    seen = scene if isinstance(method, SubdividingMethod) else scene.averaged_over_step(t, dt)
     return scene.replace(state=scene.normalised(method(seen, time_for_method(method, t), scene.state, dt)))
 
 

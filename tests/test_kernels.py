@@ -86,7 +86,7 @@ def test_an_operation_is_the_same_number_by_number(name):
 
     def run(x, v):
         kernel = LaneKernel.of(lambda i, _, rest: function(*rest), (LANES,), start, (x, v), masks)
-        return kernel.join(kernel.advance(kernel.start(start), jnp.int32(0), 1))
+        return kernel.moving.join(kernel.advance(kernel.start(start), jnp.int32(0), 1))
 
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), jax.jit(run)(x, v), wanted)
 

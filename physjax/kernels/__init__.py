@@ -8,6 +8,6 @@ asks the host.
 The kernel is for runs by themselves. Derivatives, and runs that a transformation is around, take the plain loop.
 """
 
-from physjax.kernels.flights import LaneKernel
+from physjax.kernels.flights import LaneKernel, Layout
 
-__all__ = ["LaneKernel"]
+__all__ = ["LaneKernel", "Layout"]

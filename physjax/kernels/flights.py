@@ -139,10 +139,6 @@ class LaneKernel(NamedTuple):
         """What a run carries: an array of all lanes for each number of one."""
         return self.moving.split(moving)[0]
 
-    def join(self, carried: Sequence[Array], leading: int = 0) -> PyTree:
-        """The arrays as they were given, behind as many leading axes as there are in front of the lanes."""
-        return self.moving.join(carried)
-
     def advance(self, carried: Sequence[Array], first: Array, count: int) -> list[Array]:
         """`count` steps from number `first` on, in one kernel."""
         lanes, moved, own = self.shape.lanes, len(carried), len(self.columns)

@@ -1,4 +1,4 @@
-"""Steps that choose their own length: `adaptive(method, ...)` subdivides the dt it is given and lands on its end."""
+"""Steps that choose their own length: `adaptive(method, ...)` subdivides the dt it is given."""
 
 from collections.abc import Callable
 from functools import partial, reduce
@@ -12,24 +12,35 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import any_lane
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
-from physjax.loops import Time, moment_at, to_float_time
+from physjax.loops import Time, moment_at
 from physjax.particles import demand_particles
 from physjax.parts import Force, as_module
 from physjax.scene import Scene, project
+from physjax.stepping.doubling import Doubling
+from physjax.stepping.pairs import Attempt, Pair, read_pair
 from physjax.stepping.registry import read_promises
-from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
+from physjax.stepping.step_control import (
+    SHORTEST_STEP_SHARE,
+    StepRecord,
+    Tolerance,
+    choose_factor,
+    choose_factor_of_lecture,
+    choose_first_step,
+    find_jumps,
+    max_over_shared_step,
+    scaled_norm,
+)
+from physjax.stepping.system import S, System, leaf_dtype, read_traits
+from physjax.stepping.walk import Course, Walk, begin_walk, walk_on, walk_through
 from physjax.vectors import add_trailing_axes, norm
 
-SAFETY_FACTOR, LECTURE_SAFETY_FACTOR = 0.8, 0.9
-"""The next step relative to the one that would just keep the tolerance: ours rejects fewer steps than the lecture's."""
-SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR = 0.2, 5.0
-"""Bounds of the next step relative to the last: one estimate of the error is not trusted further."""
-NEGLIGIBLE_ERROR = 1e-10
-"""An error, in units of the tolerance, that counts as none."""
-SHORTEST_STEP_SHARE = 1e-6
-"""The shortest step where none is given, relative to the dt that is subdivided."""
+MAX_FRAMES_PER_STEP = 64
+"""The longest step where none is given, relative to dt: a path without any error would be left in one."""
+LATE_STAGES = ("resolve contacts", "advance memory")
+"""What is done at the end of a step, whenever in it it was due."""
+WHOLE_AND_HALVES = ((0.0, 1.0), (0.0, 0.5), (0.5, 0.5))
+"""Start and length of the three steps of an attempt, relative to it."""
 
 
 class Steps(NamedTuple):
@@ -46,10 +57,10 @@ class Steps(NamedTuple):
 
 
 class Adaptive(eqx.Module):
-    """A method that takes each of its steps whole and in two halves, and calls the difference its error.
+    """A method under error control, made by `adaptive`; `report` also returns the steps it took.
 
-    Made by `adaptive`; `report` also returns the steps it took. Steps end where a force of the system jumps, and each
-    sees the mean over itself of what jumps within it: the system is asked for that mean before every step.
+    Steps end where a force of the system jumps, and each sees the mean over itself of what jumps within it: the system is
+    asked for that mean before every step.
     """
 
     method: Callable
@@ -61,161 +72,204 @@ class Adaptive(eqx.Module):
     error: str = eqx.field(static=True)
     tries: int | None = eqx.field(static=True)
 
+    def find_pair(self, system: System) -> Pair:
+        """What knows the error of a step: the method's own pair, or the method taken twice."""
+        found = None if self.error == "velocity" else read_pair(self.method)
+        forces = [force for force in read_traits(system).forces if isinstance(force, Force) and force.jumps]
+        # to a pair, the mean of a force over a step is a constant: what it jumps by it cannot see
+        unseen = any(not force.discontinuities() for force in forces)
+        return Doubling(self.method, self.order) if found is None or unseen else found
+
     def __call__(self, system: System, t: Time, state: S, dt: ArrayLike) -> S:
         """The state a dt later; NaN where steps became shorter than `dt_min`, or more than `tries` were needed."""
         return self.report(system, t, state, dt).state
 
-    def check_scene(self, scene: Scene) -> Scene:
-        """The scene as it is; a ValueError where a contact or a force acts once a dt, whatever the steps in it."""
-        late = [f"{type(f).__name__}, a force that remembers" for f in scene.forces if f.remembers]
-        late += [
-            f"{type(contact).__name__} with response=contacts.project"
-            for contact in scene.contacts
-            if (contact.response or project) is project
-        ]
-        if late:
+    def _demand_steps_of_one_length(self, scene: Scene) -> None:
+        """Raise a ValueError where what acts at the ends of steps is that of an emitter's particles."""
+        late = [type(c).__name__ for c in scene.contacts if (c.response or project) is project]
+        late += [type(f).__name__ for f in scene.forces if f.remembers]
+        if late and scene.emitter is not None:
             raise ValueError(
-                f"adaptive: got {late[0]}, which acts once a dt and not in the steps that a tolerance chooses; expected "
-                "contacts timed by contacts.impact, and forces without memory. Use equal steps, such as methods.rk4 with a "
-                "small dt."
+                f"adaptive: got {late[0]}, which acts at the ends of steps, and an emitter, whose particles each have steps of "
+                "their own; expected contacts timed by contacts.impact, and forces without memory. Use equal steps, such "
+                "as methods.rk4 with a small dt."
             )
-        return scene
 
     def report(self, system: System, t: Time, state: PyTree, dt: Time) -> Steps:
-        """The state a dt later, with the counts of accepted and rejected steps."""
-        shape, kind = read_traits(system).status_shape, leaf_dtype(state)
-        dt = jnp.broadcast_to(jnp.asarray(dt, kind), shape)
-        floor = SHORTEST_STEP_SHARE * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
-        # a step below rounding would leave the time where it is
-        floor = jnp.maximum(floor, 16 * jnp.finfo(kind).eps * dt)
-        ceiling = dt if self.dt_max is None else jnp.minimum(self.dt_max.astype(kind), dt)
-        h = jnp.clip(self._choose_first_step(system, t, state, dt), floor, ceiling)
-        none = jnp.zeros(shape, jnp.int32)
-        start = _Progress(
-            state=state, elapsed=jnp.zeros(shape, kind), h=lax.stop_gradient(h), accepted=none, rejected=none, shortest=dt,
-            failed=jnp.zeros(shape, bool), last=jnp.full(shape, jnp.inf, kind), error=jnp.ones(shape, kind),
-        )  # fmt: skip
-        attempt = partial(
-            self._attempt_step,
-            system,
-            t,
-            dt,
-            partial(_find_next_stop, _find_jumps(system, t, shape), dt),
-            floor,
-            ceiling,
+        """The state a dt later, with the counts of accepted and rejected steps, the last of which ends there."""
+        if isinstance(system, Scene):
+            self._demand_steps_of_one_length(system)
+        dt = jnp.broadcast_to(jnp.asarray(dt, leaf_dtype(state)), read_traits(system).status_shape)
+        first, slope = self._choose_first_step(system, t, state, dt)
+        course = self._plan(system, lambda frame: t, dt, lands=True)
+        walk = walk_on(course, begin_walk(course, state, slope, first), dt)
+        return self._report(walk, walk.attempt.end, dt)
+
+    def start(self, system: System, t: Time, state: PyTree, dt: ArrayLike) -> Walk:
+        """A walk before its first step, whose steps go on from one dt to the next."""
+        dt = jnp.broadcast_to(jnp.asarray(dt, leaf_dtype(state)), read_traits(system).status_shape)
+        first, slope = self._choose_first_step(system, t, state, dt)
+        return begin_walk(self._plan(system, lambda frame: t, dt, lands=self._lands(system)), state, slope, first)
+
+    def advance(self, system: System, t: Time, state: S, dt: ArrayLike, memory: Walk) -> tuple[S, Walk]:
+        """The state a dt later, read off the step that reaches there, and the walk."""
+        steps, walk = self.report_walk(system, t, dt, memory)
+        return steps.state, walk
+
+    def sample(
+        self, system: System, clock: Callable[[Array], Time], dt: ArrayLike, frames: int, memory: Walk
+    ) -> tuple[PyTree, Walk]:
+        """The states at the ends of `frames` dt, the n-th of which begins at `clock(n)`, and the walk."""
+        progress = memory.progress
+        dt = jnp.broadcast_to(jnp.asarray(dt, progress.elapsed.dtype), progress.elapsed.shape)
+        course = self._plan(system, clock, dt, lands=self._lands(system))
+        states, walk = walk_through(course, memory, dt, frames, lambda walk: self._read(system, course, walk, dt))
+        legal = self._is_legal(dt)
+        return jax.tree.map(
+            lambda leaf: jnp.where(add_trailing_axes(legal, leaf.ndim - 1), leaf, jnp.nan), states
+        ), walk
+
+    def report_walk(self, system: System, t: Time, dt: ArrayLike, walk: Walk) -> tuple[Steps, Walk]:
+        """`advance`, with the counts of steps."""
+        progress = walk.progress
+        dt = jnp.broadcast_to(jnp.asarray(dt, progress.elapsed.dtype), progress.elapsed.shape)
+        course = self._plan(system, lambda frame: t, dt, lands=self._lands(system))
+        walk = walk_on(course, walk, dt)
+        state = self._read(system, course, walk, dt)
+        return self._report(walk, state, dt), walk._replace(progress=walk.progress.begin_next(dt))
+
+    def _read(self, system: System, course: Course, walk: Walk, dt: Array) -> PyTree:
+        """The state at the end of dt, within the step that reaches there."""
+        progress = walk.progress
+        if self._lands(system):
+            return course.normalise(walk.attempt.end)
+        share = jnp.clip((dt - progress.elapsed) / progress.length, 0.0, 1.0)
+        begun, length = course.clock(progress.frame) + progress.elapsed, progress.length
+        state = self.find_pair(system).interpolate(system, begun, walk.start, length, walk.attempt, share)
+        return course.normalise(state)
+
+    def step_scene(self, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
+        """The scene a dt later, in steps after each of which contacts act and forces remember, as after those of any method.
+
+        The error of such a step is what two of half the length change. What is done at its end came late by up to all of
+        it: that much of the change of the rates which it made counts as well.
+        """
+        return self.walk_scene(scene, t, dt)[0]
+
+    def walk_scene(self, scene: Scene, t: Time, dt: ArrayLike) -> tuple[Scene, Steps]:
+        """`step_scene`, with the counts of steps."""
+        dt = jnp.broadcast_to(jnp.asarray(dt, scene.state.dtype), scene.status_shape)
+        changing = scene.changing()
+        moving, still = eqx.partition(scene, changing)
+        join = lambda moving: eqx.combine(moving, still)  # noqa: E731
+
+        def attempt(t: Time, start: PyTree, length: Array, slope: PyTree) -> Attempt:
+            def part(middle: PyTree, share: Array) -> tuple[PyTree, PyTree]:
+                begun = jax.tree.map(lambda a, b: jnp.where(share[0] > 0, a, b), middle, start)
+                end, late = _step_with_lateness(join(begun), self.method, t + share[0] * length, share[1] * length)
+                end = eqx.filter(end, changing)
+                return end, (end, late)
+
+            _, (ends, late) = lax.scan(part, start, jnp.asarray(WHOLE_AND_HALVES, dt.dtype))
+            whole, end = (jax.tree.map(lambda leaf, i=i: leaf[i], ends) for i in (0, 2))
+            error = jax.tree.map(
+                lambda a, b, c: jnp.maximum(jnp.abs(a - b), jnp.max(c[1:], axis=0)), whole.state, end.state, late
+            )
+            return Attempt(end, error, None, ())
+
+        first, _ = self._choose_first_step(scene, t, scene.state, dt)
+        course = self._plan(scene, lambda frame: t, dt, lands=True)
+        rounding = 16 * float(jnp.finfo(dt.dtype).eps) * dt
+        course = course._replace(
+            attempt=attempt,
+            measure=lambda start, tried: scaled_norm(
+                tried.error, self._tolerance.at(start.state, tried.end.state), dt.shape
+            ),
+            normalise=lambda moving: moving,
+            # what comes late is cured by short steps alone
+            floor=course.floor if self.dt_min is not None else rounding,
         )
-        if self.tries is None:
-            end = lax.while_loop(lambda walk: any_lane(walk.going(dt)), attempt, start)
-        else:
-            end, _ = lax.scan(lambda walk, _: (attempt(walk), None), start, None, length=self.tries)
-        # a dt or a tolerance that is traced cannot raise; one that is not > 0 has no end and no error
+        walk = walk_on(course, begin_walk(course, moving, None, first), dt)
+        after = join(walk.attempt.end)
+        steps = self._report(walk, after.state, dt)
+        return after.replace(state=steps.state), steps
+
+    def _lands(self, system: System) -> bool:
+        """Whether steps end with dt: where the path within them is not as right as they are, or nobody knows how right."""
+        pair = self.find_pair(system)
+        return pair.dense_order < pair.error_order or self.error == "velocity"
+
+    @property
+    def _tolerance(self) -> Tolerance:
+        return Tolerance(self.atol, self.rtol)
+
+    def _choose_first_step(self, system: System, t: Time, state: S, dt: Array) -> tuple[Array, S | None]:
+        """The length of the first step [s], and the slope at its start where steps begin with the last one of the one before."""
+        pair = self.find_pair(system)
+        first, slope = choose_first_step(system, t, state, dt, self._tolerance, pair.error_order)
+        # at a jump the slope is another one after it than before
+        jumps = any(isinstance(force, Force) and force.jumps for force in read_traits(system).forces)
+        return first, slope if pair.keeps_slope and not jumps else None
+
+    def _plan(self, system: System, clock: Callable[[Array], Time], dt: Array, *, lands: bool) -> Course:
+        """How the steps of one dt are taken: the last of them `lands` on its end, or goes on beyond it."""
+        kind, shape, pair = dt.dtype, dt.shape, self.find_pair(system)
+        longest = dt if lands else MAX_FRAMES_PER_STEP * dt
+        floor = SHORTEST_STEP_SHARE * dt if self.dt_min is None else jnp.minimum(self.dt_min.astype(kind), dt)
+
+        return Course(
+            clock=clock,
+            attempt=partial(pair.attempt, system),
+            measure=partial(self._measure_error, shape=shape),
+            normalise=read_traits(system).normalised or (lambda state: state),
+            choose_factor=partial(self._choose_factor, order=pair.error_order),
+            find_jumps=lambda t: find_jumps(system, t, shape),
+            end=dt if lands else jnp.full_like(dt, jnp.inf),
+            # a step below rounding would leave the time where it is
+            floor=jnp.maximum(floor, 16 * float(jnp.finfo(kind).eps) * dt),
+            ceiling=longest if self.dt_max is None else jnp.minimum(self.dt_max.astype(kind), longest),
+            tries=self.tries,
+        )
+
+    def _choose_factor(self, step: StepRecord, before: StepRecord, good: Array, order: int) -> Array:
+        if self.error == "velocity":
+            return choose_factor_of_lecture(step.error)
+        return choose_factor(step, before, good, order)
+
+    def _measure_error(self, start: PyTree, tried: Attempt, shape: tuple[int, ...]) -> Array:
+        """The largest error in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
+        if self.error == "velocity":
+            demand_particles("error='velocity'", tried.end, "bodies have momenta. Leave it out")
+            worst = norm(tried.error.velocity)
+            return max_over_shared_step(worst, shape) / self.atol.astype(worst.dtype)
+        return scaled_norm(tried.error, self._tolerance.at(start, tried.end), shape)
+
+    def _is_legal(self, dt: Array) -> Array:
+        """Where a dt and tolerances that are traced, and so cannot raise, are > 0: others have no end and no error."""
         bounds = (dt, *(b for b in (self.atol, self.rtol, self.dt_min, self.dt_max) if b is not None))
         legal = [jnp.all(b > 0) if b.ndim == 0 else b > 0 for b in bounds if isinstance(b, Tracer)]
-        ok = reduce(jnp.logical_and, legal, ~end.failed & ~end.going(dt))
+        return reduce(jnp.logical_and, legal, jnp.ones(dt.shape, bool))
+
+    def _report(self, walk: Walk, state: PyTree, dt: Array) -> Steps:
+        """The state, NaN where it was not reached, with the counts of steps."""
+        progress = walk.progress
+        ok = ~progress.failed & progress.has_arrived(dt) & self._is_legal(dt)
         # a product, not `where`: the derivatives of a failed lane must be NaN as well, and `where` would make them zero
         state = jax.tree.map(
-            lambda leaf: leaf * add_trailing_axes(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf.ndim), end.state
+            lambda leaf: leaf * add_trailing_axes(jnp.where(ok, 1.0, jnp.nan).astype(leaf.dtype), leaf.ndim), state
         )
-        return Steps(state, end.accepted, end.rejected, end.shortest, ok)
-
-    def _attempt_step(
-        self, system: System, t: Time, dt: Array, next_stop: Callable, floor: Array, ceiling: Array, walk: "_Progress"
-    ) -> "_Progress":
-        """One step whole and in halves, kept if both agree, and the next length from how well they do."""
-        stop = next_stop(walk.elapsed)
-        going, left = walk.going(dt), stop - walk.elapsed
-        # two equal steps to the end rather than a long and a tiny one
-        last = walk.h >= left
-        h = jnp.where(last, left, jnp.where(2 * walk.h > left, left / 2, walk.h))
-        h = jnp.where(going, h, 0.0)
-        begun = t + walk.elapsed
-        whole = self._take_step(system, begun, walk.state, h)
-        middle = self._take_step(system, begun, walk.state, h / 2)
-        halves = self._take_step(system, begun + h / 2, middle, h / 2)
-        error = lax.stop_gradient(self._measure_error(walk.state, whole, halves, h.shape))
-        good = going & (error <= 1.0)
-        bad = going & ~good
-        factor = self._choose_factor(walk, h, error, good)
-        # cut short by the end, a step says little about how long the next may be
-        longer = jnp.where(good, jnp.maximum(h * factor, jnp.where(last, walk.h, 0.0)), h * factor)
-        return _Progress(
-            state=jax.tree.map(lambda a, b: jnp.where(add_trailing_axes(good, a.ndim), a, b), halves, walk.state),
-            elapsed=jnp.where(good, jnp.where(last, stop, walk.elapsed + h), walk.elapsed),
-            h=jnp.where(going, jnp.clip(longer, floor, ceiling), walk.h),
-            accepted=walk.accepted + good.astype(jnp.int32),
-            rejected=walk.rejected + bad.astype(jnp.int32),
-            shortest=jnp.where(good, jnp.minimum(walk.shortest, h), walk.shortest),
-            failed=walk.failed | (bad & ~(h > floor)),  # negated, so that a step of NaN fails as well
-            last=jnp.where(good, h, walk.last),
-            error=jnp.where(good, error, walk.error),
-        )
-
-    def _take_step(self, system: System, t: Time, state: S, h: Array) -> S:
-        """One step of the method, with what jumps in time replaced by its mean over the step."""
-        # the mean over no time is 0/0: NaN, which would come back in a derivative although it is not selected
-        return self.method(average_over_step(system, t, jnp.where(h > 0, h, 1.0)), t, state, h)
-
-    def _choose_factor(self, walk: "_Progress", h: Array, error: Array, good: Array) -> Array:
-        """By how much longer the next step may be: as this error allows, or less where errors have been growing.
-
-        The trend, from the accepted step before, is K. Gustafsson's (1994; Hairer and Wanner, section IV.8): without it
-        a fifth of all tries is rejected where a body falls towards another, as each step is harder than the last.
-        """
-        if self.error == "velocity":
-            factor = LECTURE_SAFETY_FACTOR * jnp.maximum(error, NEGLIGIBLE_ERROR) ** -0.5
-        else:
-            power = 1 / (self.order + 1)
-            now, before = jnp.maximum(error, NEGLIGIBLE_ERROR), jnp.maximum(walk.error, NEGLIGIBLE_ERROR)
-            factor = SAFETY_FACTOR * now**-power
-            # no step before: its length is infinite, and nothing is known
-            trend = jnp.where(jnp.isfinite(walk.last), h / walk.last * (before / now) ** power, 1.0)
-            factor = jnp.where(good, factor * jnp.minimum(trend, 1.0), factor)
-        return jnp.where(
-            jnp.isfinite(error), jnp.clip(factor, SMALLEST_STEP_FACTOR, LARGEST_STEP_FACTOR), SMALLEST_STEP_FACTOR
-        )
-
-    def _measure_error(self, start: PyTree, whole: PyTree, halves: PyTree, shape: tuple[int, ...]) -> Array:
-        """The largest difference in units of the tolerance; or, as in the lecture, |v₁ - v₂| alone over atol."""
-        if self.error == "velocity":
-            demand_particles("error='velocity'", halves, "bodies have momenta. Leave it out")
-            worst = norm(halves.velocity - whole.velocity)
-            return _max_over_shared_step(worst, shape) / self.atol.astype(worst.dtype)
-        return _scaled_norm(jax.tree.map(lambda a, b: a - b, halves, whole), self._tolerance(start, halves), shape)
-
-    def _tolerance(self, start: S, end: S) -> S:
-        size = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), start, end)
-        return jax.tree.map(lambda s: self.atol.astype(s.dtype) + self.rtol.astype(s.dtype) * s, size)
-
-    def _choose_first_step(self, system: System, t: Time, state: PyTree, dt: Array) -> Array:
-        """A first length from how fast the state and its rate change (Hairer, Nørsett, Wanner, section II.4)."""
-        shape, tolerance = dt.shape, self._tolerance(state, state)
-        slope = system.rate(t, state)
-        size, speed = _scaled_norm(state, tolerance, shape), _scaled_norm(slope, tolerance, shape)
-        small = 0.01 * jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1.0), 1e30)
-        small = jnp.clip(small, SHORTEST_STEP_SHARE * dt, dt)
-        ahead = jax.tree.map(lambda y, k: y + add_trailing_axes(small, y.ndim) * k, state, slope)
-        turn = jax.tree.map(lambda a, b: a - b, system.rate(t + small, ahead), slope)
-        second_derivative = jnp.maximum(_scaled_norm(turn, tolerance, shape) / small, 1e-30)
-        # half of y'' dt² is what a step of first order misses
-        return jnp.minimum(100 * small, (0.01 / jnp.maximum(second_derivative, speed)) ** (1 / (self.order + 1)))
+        return Steps(state, progress.taken, progress.rejected, progress.shortest, ok)
 
 
-class _Progress(NamedTuple):
-    """How far the steps have come; `last` and `error` are of the last step accepted."""
-
-    state: PyTree
-    elapsed: Array
-    h: Array
-    accepted: Array
-    rejected: Array
-    shortest: Array
-    failed: Array
-    last: Array
-    error: Array
-
-    def going(self, dt: Array) -> Array:
-        """Which have not reached the end."""
-        return (self.elapsed < dt) & ~self.failed
+def _step_with_lateness(scene: Scene, method: Callable, t: Time, dt: Array) -> tuple[Scene, PyTree]:
+    """A step of the scene, and by how much the state may be wrong since contacts and memories act at the step's end."""
+    late = jax.tree.map(jnp.zeros_like, scene.state)
+    for stage in scene.stages(method, t, dt):
+        before, scene = scene, stage.run(scene)
+        if stage.name in LATE_STAGES:
+            rates = (at.rate(t + dt, at.state) for at in (before, scene))
+            late = jax.tree.map(lambda late, a, b: late + add_trailing_axes(dt, a.ndim) * jnp.abs(a - b), late, *rates)
+    return scene, late
 
 
 def adaptive(
@@ -229,24 +283,27 @@ def adaptive(
     error: str = "state",
     tries: int | None = None,
 ) -> Adaptive:
-    """A method that subdivides its own dt so that no step's error exceeds the tolerance, by step doubling.
+    """A method that subdivides its own dt so that no step's error exceeds the tolerance.
 
-    Each step is taken whole and in two halves; E = max |y₁ - y₂| / (atol + rtol |y|) over position and velocity. E <= 1
-    keeps the halves, otherwise the step is redone; the next is 0.8 E^(-1/(p+1)) times as long, p the method's order, at
-    most 5 times, and less where the error has been growing. Every independent lane has steps of its own, and all land
-    exactly on the end of dt: 3 times the evaluations of the method a try, and two to begin a dt with, so give it long
-    ones. Steps end where a force jumps (`Kick`, `Control`, `Blast`); a force of your own that jumps and gives neither
-    `averaged_over_step` nor `discontinuities` (see `Force`) can be stepped over. Forces with memory and contacts resolved
-    by `contacts.project` act once a dt, which no tolerance can mend: a scene with them is refused with a ValueError.
-    Timed contacts are counted per dt as well: a flight shorter than a quarter of dt is the last before rest, and after
-    64 contacts in one dt (8 of a body) a lane waits for the next, so take a dt in which few bounces happen.
+    The error of a step is known where the method is a pair (`tsit5`, `dopri8`, `dprkn6`, `tr_bdf2`): it costs nothing.
+    Any other method takes each step whole and in two halves, and the difference is the error, for three times the
+    evaluations. E = max |error| / (atol + rtol |y|) over position and velocity; E <= 1 keeps the step, otherwise it is
+    redone, and the next is 0.77 E^(-1/(p+1)) times as long, p the order of the error, at most 5 times, and less where
+    the error has been growing. Every independent lane has steps of its own, which go on from one dt to the next: in
+    between states are read off the path within a step, so that dt costs nothing, and may be as short as a film needs.
+
+    Steps end where a force jumps (`Kick`, `Control`, `Blast`); a force of your own that jumps and gives neither
+    `averaged_over_step` nor `discontinuities` (see `Force`) can be stepped over. Where there are contacts, prescribed motion,
+    or forces that remember, these act after every step, steps are doubled, and the last of them ends with dt. What is
+    resolved at the end of a step (`contacts.project`, springs that break) makes it as short as its lateness demands: timed
+    contacts are far cheaper.
 
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
     (a millionth of dt, if not given) ends that lane as NaN: see `.ok` and `.first_bad_step` of a run. `tries` bounds
-    the steps of one dt and makes the run differentiable in reverse; where more are needed, state and derivatives are NaN
-    as well. Symplectic methods (semi-implicit Euler, verlet, leapfrog) lose their bounded energy: with steps that depend
-    on the state it drifts.
+    the steps of one dt; where more are needed, the state is NaN. Derivatives, forward and reverse, are those of the steps
+    taken, up to 16 384 of them in one dt, beyond which they are NaN. Symplectic methods (semi-implicit Euler, verlet,
+    leapfrog) lose their bounded energy: with steps that depend on the state it drifts.
 
     Example:
         >>> careful = methods.adaptive(methods.rk4, atol=1e-5, rtol=1e-5)
@@ -302,46 +359,27 @@ def count_steps(scene: Scene, method: Adaptive, *, dt: ArrayLike, steps: int) ->
 def _count_steps(scene: Scene, method: Adaptive, dt: Array, steps: int) -> Steps:
     dt = dt.astype(scene.state.dtype)
     arrays, still = eqx.partition(scene, eqx.is_array)
+    walk = (
+        method.start(scene, moment_at(jnp.zeros((), jnp.int32), dt, dt.dtype), scene.state, dt)
+        if scene.only_moves
+        else None
+    )
 
-    def one(arrays: Scene, i: Array) -> tuple[Scene, Steps]:
+    def one(carried: tuple[Scene, Walk | None], i: Array) -> tuple[tuple[Scene, Walk | None], Steps]:
+        arrays, walk = carried
         scene = eqx.combine(arrays, still)
         t = moment_at(i, dt, scene.state.dtype)
-        reported = method.report(scene, t, scene.state, dt)
-        after = scene.step(method, t, dt)
-        return eqx.filter(after, eqx.is_array), reported._replace(state=after.state)
+        if walk is not None:
+            steps, walk = method.report_walk(scene, t, dt, walk)
+            after = scene.replace(state=steps.state)
+        elif scene.emitter is not None:
+            steps = method.report(scene, t, scene.state, dt)
+            after = scene.step(method, t, dt)
+        else:
+            after, steps = method.walk_scene(scene, t, dt)
+        return (eqx.filter(after, eqx.is_array), walk), steps._replace(state=after.state)
 
-    return lax.scan(one, arrays, jnp.arange(steps, dtype=jnp.int32))[1]
-
-
-def _find_jumps(system: System, t: Time, shape: tuple[int, ...]) -> list[Array]:
-    """When forces of a system jump, after t [s]: `(*shape, k)` each."""
-    found = []
-    for force in read_traits(system).forces:
-        for times in map(jnp.asarray, force.discontinuities() if isinstance(force, Force) else ()):
-            own = shape and times.shape[: len(shape)] == shape
-            times = times.reshape((*shape, -1)) if own else times.reshape((1,) * len(shape) + (-1,))
-            found.append(times - jnp.broadcast_to(to_float_time(t), shape)[..., None])
-    return found
-
-
-def _find_next_stop(jumps: list[Array], dt: Array, elapsed: Array) -> Array:
-    """The end of dt, or the first jump before it that has not been reached."""
-    for times in jumps:
-        ahead = jnp.where(times > elapsed[..., None], times, jnp.inf)
-        dt = jnp.minimum(dt, jnp.min(ahead, axis=-1))
-    return dt
-
-
-def _scaled_norm(state: S, tolerance: S, shape: tuple[int, ...]) -> Array:
-    """The largest component in units of its tolerance, for each scene or lane."""
-    leaves = [jnp.abs(a / b) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(tolerance), strict=True)]
-    largest = reduce(jnp.maximum, [leaf[..., i] for leaf in leaves for i in range(leaf.shape[-1])])
-    return _max_over_shared_step(largest, shape)
-
-
-def _max_over_shared_step(number: Array, shape: tuple[int, ...]) -> Array:
-    """The largest number of all lanes that share a step."""
-    return jnp.max(number, axis=tuple(range(len(shape), number.ndim)))
+    return lax.scan(one, (arrays, walk), jnp.arange(steps, dtype=jnp.int32))[1]
 
 
 __all__ = ["Adaptive", "Steps", "adaptive", "count_steps"]

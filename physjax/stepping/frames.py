@@ -4,7 +4,7 @@ Each way carries the state in a form of its own and brings it back: the physics 
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
@@ -16,8 +16,19 @@ from physjax.programs import count_operations, holds_loops
 from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 
-Step = Callable[[Array, PyTree, PyTree, Array], PyTree]
-"""A step of a scene: `(number, moving, still, dt) -> moving`, the arrays that it changes and those that it does not."""
+if TYPE_CHECKING:
+    from physjax.kernels import LaneKernel, Layout
+
+
+class Moving(NamedTuple):
+    """What a step changes: arrays of the scene, and the memory of a method that has one."""
+
+    arrays: PyTree
+    memory: PyTree
+
+
+Step = Callable[[Array, Moving, PyTree, Array], Moving]
+"""A step of a scene: `(number, moving, still, dt) -> moving`; `still` are the arrays of the scene that it does not change."""
 
 
 @runtime_checkable
@@ -32,8 +43,12 @@ class Steps(Protocol):
         """`count` steps from number `first` on."""
         ...
 
-    def join(self, carried: Any, leading: int = 0) -> PyTree:
-        """The arrays of the scene again, behind `leading` further axes."""
+    def keep(self, carried: Any) -> Any:
+        """What is kept at a frame: all but the memory."""
+        ...
+
+    def join(self, carried: Any, leading: int = 0) -> Moving:
+        """What is carried, or what was kept of it, as it was given, behind `leading` further axes."""
         ...
 
 
@@ -64,7 +79,11 @@ class WholeSteps(NamedTuple):
         """A loop that reverse mode goes back through."""
         return repeat_steps(self.step, carried, first, count, unrolled=self.unrolled)
 
-    def join(self, carried: PyTree, leading: int = 0) -> PyTree:
+    def keep(self, carried: Moving) -> Moving:
+        """The arrays of the scene."""
+        return carried._replace(memory=None)
+
+    def join(self, carried: Moving, leading: int = 0) -> Moving:
         """Components are the last axis."""
         return join_vectors(carried)
 
@@ -92,9 +111,37 @@ class BlockedSteps(NamedTuple):
         masks = self.scene.build_lane_mask((self.still, self.dt))
         return self.blocks.map(advance_block, carried, self.still, self.dt, masks=masks)
 
-    def join(self, carried: PyTree, leading: int = 0) -> PyTree:
+    def keep(self, carried: Moving) -> Moving:
+        """The arrays of the scene."""
+        return carried._replace(memory=None)
+
+    def join(self, carried: Moving, leading: int = 0) -> Moving:
         """Blocks side by side."""
         return self.blocks.join(carried, leading)
+
+
+class KernelSteps(NamedTuple):
+    """All steps of a frame in one kernel; what is carried are columns, an array of all lanes for each number of one."""
+
+    kernel: "LaneKernel"
+    kept: "Layout"
+
+    def start(self, moving: Moving) -> list[Array]:
+        """Columns."""
+        return self.kernel.start(moving)
+
+    def advance(self, carried: list[Array], first: Array, count: int) -> list[Array]:
+        """The kernel."""
+        return self.kernel.advance(carried, first, count)
+
+    def keep(self, carried: list[Array]) -> list[Array]:
+        """The columns of the arrays of the scene, which come first."""
+        return carried[: self.kept.count_numbers(own=True)]
+
+    def join(self, carried: list[Array], leading: int = 0) -> Moving:
+        """Arrays of all lanes."""
+        layout = self.kernel.moving
+        return (layout if len(carried) == layout.count_numbers(own=True) else self.kept).join(carried)
 
 
 def choose_steps(
@@ -112,7 +159,12 @@ def _build_kernel(scene: Scene, step: Step, moving: PyTree, still: PyTree, dt: A
     """The kernel for a scene whose lanes do not see each other; None where it must not be cut or holds what no kernel does."""
     if scene.emitter is not None or not scene.may_be_cut():
         return None
-    from physjax.kernels import LaneKernel  # Pallas takes a while to import
+    from physjax.kernels import LaneKernel, Layout  # Pallas takes a while to import
 
     masks = tuple(map(scene.build_lane_mask, (moving, (still, dt))))
-    return LaneKernel.of(lambda i, moving, rest: step(i, moving, *rest), scene.state.lanes, moving, (still, dt), masks)
+    lanes = scene.state.lanes
+    kernel = LaneKernel.of(lambda i, moving, rest: step(i, moving, *rest), lanes, moving, (still, dt), masks)
+    if kernel is None:
+        return None
+    kept = Layout.of(moving._replace(memory=None), masks[0]._replace(memory=None), lanes, kernel.moving.padded)
+    return KernelSteps(kernel, kept)

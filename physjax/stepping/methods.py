@@ -12,10 +12,12 @@ from jax.typing import ArrayLike
 from physjax.loops import Time
 from physjax.stepping.adaptive import adaptive, count_steps
 from physjax.stepping.compositions import BLANES_MOAN_4, KAHAN_LI_8, compose_leapfrogs, take_split_step
-from physjax.stepping.implicit import ImplicitEuler
-from physjax.stepping.registry import METHODS, Promises, promises
+from physjax.stepping.implicit import ImplicitEuler, ImplicitMidpoint, TrBdf2
+from physjax.stepping.nystrom import DPRKN6, NystromPair, take_nystrom_step
+from physjax.stepping.registry import METHODS, SPECIAL_METHODS, Promises, find_method, promises
 from physjax.stepping.system import S, System
-from physjax.stepping.tableaus import DOPRI8, EULER, HEUN, MIDPOINT, RK4, TSIT5, take_step
+from physjax.stepping.tableaus import DOPRI8, EULER, HEUN, MIDPOINT, RK4, TSIT5, TableauPair, take_step
+from physjax.stepping.time_scaled import time_scaled
 
 
 @promises(order=1, evaluations=1, stability_limit=0.0)
@@ -105,7 +107,7 @@ def rk4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(RK4, system, t, state, dt)
 
 
-@promises(order=2, evaluations=2, stability_limit=0.0, charted=False)
+@promises(order=2, evaluations=2, stability_limit=0.0)
 def heun(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Heun's method, the explicit trapezoid: the mean of the slopes at both ends. An oscillation grows as under midpoint.
 
@@ -117,7 +119,7 @@ def heun(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(HEUN, system, t, state, dt)
 
 
-@promises(order=5, evaluations=6, stability_limit=1.0555, charted=False)
+@promises(order=5, evaluations=6, stability_limit=1.0554808, pair=TableauPair(TSIT5))
 def tsit5(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Tsitouras' Runge-Kutta method of order 5, for smooth forces of any kind; equals `diffrax.Tsit5` step for step.
 
@@ -131,7 +133,7 @@ def tsit5(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(TSIT5, system, t, state, dt)
 
 
-@promises(order=8, evaluations=13, stability_limit=3.7198, charted=False)
+@promises(order=8, evaluations=13, stability_limit=3.719823, pair=TableauPair(DOPRI8))
 def dopri8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Prince and Dormand's Runge-Kutta method of order 8, for errors below 1e-8, in float64; equals `diffrax.Dopri8`.
 
@@ -145,7 +147,7 @@ def dopri8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(DOPRI8, system, t, state, dt)
 
 
-@promises(order=4, evaluations=7, stability_limit=3.1634, order_with_drag=1, charted=False)
+@promises(order=4, evaluations=7, stability_limit=3.1634, order_with_drag=1, special=True)
 def blanes_moan4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Blanes and Moan's symplectic splitting of order 4: energy bounded.
 
@@ -161,7 +163,7 @@ def blanes_moan4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_split_step(BLANES_MOAN_4, system, t, state, dt)
 
 
-@promises(order=8, evaluations=17, stability_limit=3.0964, order_with_drag=1, charted=False)
+@promises(order=8, evaluations=17, stability_limit=3.0964, order_with_drag=1, special=True)
 def kahan_li8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Kahan and Li's composition of 17 leapfrogs: symplectic, order 8, energy bounded.
 
@@ -175,27 +177,54 @@ def kahan_li8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return compose_leapfrogs(KAHAN_LI_8, system, t, state, dt)
 
 
+@promises(order=6, evaluations=6, stability_limit=1.6292, order_with_drag=0, pair=NystromPair(DPRKN6), special=True)
+def dprkn6(system: System, t: Time, state: S, dt: ArrayLike) -> S:
+    """Dormand and Prince's Runge-Kutta-Nyström method of order 6, for smooth forces of place and time alone.
+
+    A ValueError while tracing where a force looks at the velocity, or bodies rotate in space. An undamped oscillation gains
+    less than 2e-4 of itself a step up to the limit, and less than 1e-8 up to ω·dt = 0.46.
+
+    Example:
+        >>> end = methods.dprkn6(swing, 0.0, swing.state, 0.25)
+        >>> bool(abs(end.position[0] - np.cos(2.0 * 0.25)) < 1e-7)
+        True
+    """
+    return take_nystrom_step(DPRKN6, system, t, state, dt)
+
+
 implicit_euler = ImplicitEuler()
 """Implicit Euler, linearised once a step: stable at any step, damps; `ImplicitEuler(newton=20)` converges the full step."""
-METHODS[implicit_euler.__name__] = implicit_euler
+implicit_midpoint = ImplicitMidpoint()
+"""The implicit midpoint rule: order 2, keeps what oscillates; `ImplicitMidpoint(newton=20)` where springs turn far in a step."""
+tr_bdf2 = TrBdf2()
+"""TR-BDF2: order 2, damps what is stiff, knows its error; `TrBdf2(newton=20)` where springs turn far in a step."""
+METHODS.update({method.__name__: method for method in (implicit_euler, implicit_midpoint, tr_bdf2)})
 
 __all__ = [
     "METHODS",
+    "SPECIAL_METHODS",
     "ImplicitEuler",
+    "ImplicitMidpoint",
     "Promises",
+    "TrBdf2",
     "adaptive",
     "blanes_moan4",
     "count_steps",
     "dopri8",
+    "dprkn6",
     "euler",
+    "find_method",
     "heun",
     "implicit_euler",
+    "implicit_midpoint",
     "kahan_li8",
     "leapfrog",
     "midpoint",
     "promises",
     "rk4",
     "semi_implicit_euler",
+    "time_scaled",
+    "tr_bdf2",
     "tsit5",
     "verlet",
 ]

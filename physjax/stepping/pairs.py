@@ -28,24 +28,34 @@ class Attempt(NamedTuple):
 
 @runtime_checkable
 class Pair(Protocol):
-    """Two methods of neighbouring orders on the same slopes.
+    """Two methods of neighbouring orders on the same slopes. Each replaces what jumps in time by its mean over a step.
 
     `error_order`: an error falls as dt^(error_order + 1). `dense_order`: a state within the step is right to
-    dt^(dense_order + 1), as long as that is no worse than the step itself; 0 where there is no interpolant. `evaluations`
-    of the force a step, the first of them at the start: it is known from the step before where `keeps_slope`.
+    dt^(dense_order + 1), as long as that is no worse than the step itself; 0 where there is no interpolant. Where
+    `keeps_slope` the rate at the start of a step is known from the one before.
     """
 
-    error_order: int
-    dense_order: int
-    evaluations: int
-    keeps_slope: bool
+    @property
+    def error_order(self) -> int:
+        """See above."""
+        ...
+
+    @property
+    def dense_order(self) -> int:
+        """See above."""
+        ...
+
+    @property
+    def keeps_slope(self) -> bool:
+        """See above."""
+        ...
 
     def attempt(self, system: Any, t: Time, state: Any, dt: ArrayLike, slope: Any) -> Attempt:
         """A step dt [s] from the time t [s]; `slope` is the rate there, None where it is to be computed."""
         ...
 
-    def interpolate(self, system: Any, state: Any, dt: ArrayLike, attempt: Attempt, share: ArrayLike) -> Any:
-        """The state at a share [1] of an attempted step from `state`, one number for each lane or scene."""
+    def interpolate(self, system: Any, t: Time, state: Any, dt: ArrayLike, attempt: Attempt, share: ArrayLike) -> Any:
+        """The state at a share [1] of a step attempted from `state` at the time t [s], one number for each lane or scene."""
         ...
 
 
@@ -53,8 +63,12 @@ class Pair(Protocol):
 class Remembering(Protocol):
     """A method that goes its own way and remembers where it is, in trees of arrays that start with the lanes' axes."""
 
-    def start(self, system: Any, t: Time, state: Any) -> Any:
-        """The memory at the start of a run, before the first step from the time t [s]."""
+    def __call__(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+        """A step by itself, without a memory."""
+        ...
+
+    def start(self, system: Any, t: Time, state: Any, dt: ArrayLike) -> Any:
+        """The memory at the start of a run, before the first step dt [s] from the time t [s]."""
         ...
 
     def advance(self, system: Any, t: Time, state: Any, dt: ArrayLike, memory: Any) -> tuple[Any, Any]:

@@ -3,8 +3,22 @@
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from physjax.stepping.pairs import Pair
+
 METHODS: dict[str, Callable] = {}
-"""Every method by name, in the order of their definition."""
+"""Every method for scenes of any kind by name, in the order of their definition."""
+SPECIAL_METHODS: dict[str, Callable] = {}
+"""Every method that is made for forces of place and time alone: with others it is of order 1, or refuses them."""
+
+
+def find_method(name: str) -> Callable:
+    """The method of that name; KeyError where there is none.
+
+    Example:
+        >>> methods.find_method("rk4") is methods.rk4
+        True
+    """
+    return (METHODS | SPECIAL_METHODS)[name]
 
 
 class Promises(NamedTuple):
@@ -26,9 +40,17 @@ class Promises(NamedTuple):
 
 
 def promises(
-    *, order: int, evaluations: int, stability_limit: float, order_with_drag: int | None = None, charted: bool = True
+    *,
+    order: int,
+    evaluations: int,
+    stability_limit: float,
+    order_with_drag: int | None = None,
+    pair: Pair | None = None,
+    special: bool = False,
 ) -> Callable[[Callable], Callable]:
-    """Attach promises to a method (`method.promises`) and enter it in `METHODS`, unless it is not to be `charted`.
+    """Attach promises to a method (`method.promises`) and enter it in `METHODS`, or in `SPECIAL_METHODS`.
+
+    `pair` is what `methods.adaptive` knows the errors of its steps by (`method.pair`).
 
     Example:
         >>> enter = methods.promises(order=1, evaluations=1, stability_limit=0.0)
@@ -40,8 +62,9 @@ def promises(
         with_drag = order if order_with_drag is None else order_with_drag
         promised = Promises(order, evaluations, stability_limit, with_drag)
         method.promises = promised  # pyright: ignore[reportFunctionMemberAccess]  # a function may carry attributes
-        if charted:
-            METHODS[method.__name__] = method
+        if pair is not None:
+            method.pair = pair  # pyright: ignore[reportFunctionMemberAccess]
+        (SPECIAL_METHODS if special else METHODS)[method.__name__] = method
         return method
 
     return attach

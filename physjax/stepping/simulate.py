@@ -27,7 +27,9 @@ from physjax.loops import LAST_STEP, moment_at, time_at
 from physjax.memory import demand_memory_for_frames
 from physjax.parts import as_module, find_plain_functions, is_untransformed
 from physjax.scene import Scene
-from physjax.stepping.frames import choose_steps
+from physjax.stepping.frames import Moving, choose_steps
+from physjax.stepping.pairs import Remembering
+from physjax.stepping.sampling import Sampling, sample_frames
 from physjax.trajectory import Trajectory, select_stateful_parts
 
 
@@ -104,25 +106,15 @@ def _run_steps(
 ) -> Trajectory:
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
     dt, first_step = jnp.asarray(dt), jnp.asarray(first_step)  # of the host, where nothing is compiled
-    changing = scene.changing()
-    moving, still = eqx.partition(scene, changing)
+    arrays, still = eqx.partition(scene, scene.changing())
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
-
-    def step(i: Array, moving: PyTree, still: PyTree, dt: Array) -> PyTree:
-        return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
-
-    way = choose_steps(scene, step, moving, still, dt, frame_steps=save_every, cut=record is None, in_kernel=in_kernel)
-
-    def frame(carried: PyTree, index: Array) -> tuple[PyTree, PyTree]:
-        first = first_step + index * save_every
-        carried = way.advance(carried, first, save_every)
-        if record is None:
-            return carried, carried
-        return carried, record(clock(first + save_every), eqx.combine(way.join(carried), still).state)
-
-    last, kept = lax.scan(frame, way.start(moving), jnp.arange(frames, dtype=jnp.int32))
-    last, kept = way.join(last), way.join(kept, leading=1) if record is None else kept
-    first_kept = moving if record is None else record(clock(first_step), scene.state)
+    if record is None and isinstance(method, Sampling) and scene.only_moves and not in_kernel:
+        states = sample_frames(scene, method, dt, first_step, frames, save_every)
+        kept = eqx.filter(scene.replace(state=states), scene.changing())
+        last = jax.tree.map(lambda leaf: leaf[-1], kept)
+    else:
+        last, kept = _step_through(scene, method, dt, first_step, frames, save_every, record, in_kernel=in_kernel)
+    first_kept = arrays if record is None else record(clock(first_step), scene.state)
     kept = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first_kept, kept)
     film = None if record is not None else eqx.combine(kept, still)
     final_scene = eqx.combine(last, still)
@@ -142,6 +134,40 @@ def _run_steps(
     )
 
 
+def _step_through(
+    scene: Scene,
+    method: Callable,
+    dt: Array,
+    first_step: Array,
+    frames: int,
+    save_every: int,
+    record: Callable | None,
+    *,
+    in_kernel: bool,
+) -> tuple[PyTree, PyTree]:
+    """What steps change of a scene, at the end and at every frame behind the first; or what is recorded there."""
+    changing = scene.changing()
+    arrays, still = eqx.partition(scene, changing)
+    moving = Moving(arrays, _start_memory(scene, method, first_step, dt))
+
+    def step(i: Array, moving: Moving, still: PyTree, dt: Array) -> Moving:
+        scene, memory = _take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
+        return Moving(eqx.filter(scene, changing), memory)
+
+    way = choose_steps(scene, step, moving, still, dt, frame_steps=save_every, cut=record is None, in_kernel=in_kernel)
+
+    def frame(carried: PyTree, index: Array) -> tuple[PyTree, PyTree]:
+        first = first_step + index * save_every
+        carried = way.advance(carried, first, save_every)
+        if record is None:
+            return carried, way.keep(carried)
+        end = time_at(first + save_every, dt, scene.state.dtype)
+        return carried, record(end, eqx.combine(way.join(carried).arrays, still).state)
+
+    last, kept = lax.scan(frame, way.start(moving), jnp.arange(frames, dtype=jnp.int32))
+    return way.join(last).arrays, way.join(kept, leading=1).arrays if record is None else kept
+
+
 RUN_STRUCTURE = ("frames", "save_every", "record")
 """What of a run is structure and not numbers."""
 _run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
@@ -154,11 +180,23 @@ def _get_standalone_run(compile_bound: bool, in_kernel: bool) -> Callable[..., T
     return jit_untransformed(run, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
 
 
-def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike) -> Scene:
-    """Step number i of a loop."""
+def _start_memory(scene: Scene, method: Callable, first_step: Array, dt: ArrayLike) -> PyTree:
+    """The memory of a method that goes its own way, where nothing interferes with it; None where there is none."""
+    if not isinstance(method, Remembering) or not scene.only_moves:
+        return None
+    return method.start(scene, moment_at(first_step, dt, scene.state.dtype), scene.state, dt)
+
+
+def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike, memory: PyTree) -> tuple[Scene, PyTree]:
+    """Step number i of a loop, and the memory after it."""
     if scene.compiles_in_pieces:
         scene = scene.replace(state=split_compilation(scene.state, i))
-    return scene.step(method, moment_at(i, dt, scene.state.dtype), dt)
+    t = moment_at(i, dt, scene.state.dtype)
+    if memory is None:
+        return scene.step(method, t, dt), None
+    assert isinstance(method, Remembering)
+    state, memory = method.advance(scene, t, scene.state, dt, memory)
+    return scene.replace(state=state), memory
 
 
 @partial(jax.jit, static_argnames=("frames",))
@@ -168,16 +206,22 @@ def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame
     One compilation serves every step size, as studies of the step need. A loop of a traced length has no reverse mode.
     `steps_per_frame` is an integer. Returns the state stacked along a leading axis, frame 0 the start.
     """
+    dt, begun = jnp.asarray(dt), jnp.zeros((), jnp.int32)
+    if isinstance(method, Sampling) and scene.only_moves:
+        states = sample_frames(scene, method, dt, begun, frames, steps_per_frame)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), scene.state, states)
     changing = scene.changing()
-    moving, still = eqx.partition(scene, changing)
+    arrays, still = eqx.partition(scene, changing)
+    moving = Moving(arrays, _start_memory(scene, method, begun, dt))
 
-    def step(i: ArrayLike, moving: PyTree) -> PyTree:
+    def step(i: ArrayLike, moving: Moving) -> Moving:
         i = jnp.asarray(i, jnp.int32)  # a plain number where jit is disabled
-        return eqx.filter(_take_step(eqx.combine(moving, still), method, i, dt), changing)
+        scene, memory = _take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
+        return Moving(eqx.filter(scene, changing), memory)
 
-    def frame(moving: PyTree, index: Array) -> tuple[PyTree, PyTree]:
+    def frame(moving: Moving, index: Array) -> tuple[Moving, PyTree]:
         moving = lax.fori_loop(index * steps_per_frame, (index + 1) * steps_per_frame, step, moving)
-        return moving, eqx.combine(moving, still).state
+        return moving, eqx.combine(moving.arrays, still).state
 
     _, states = lax.scan(frame, moving, jnp.arange(frames, dtype=jnp.int32))
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), scene.state, states)

@@ -48,8 +48,9 @@ class SystemTraits(NamedTuple):
 
     `couples`: whether lanes depend on each other. `status_shape`: for what there is one step size: a lane, or a scene
     where lanes are coupled. `held`: lanes that no force moves. `mass` [kg] weights the residual of an implicit step.
-    `compile_bound`: whether a small program is worth more than a fast one: stages are then a loop.
-    `averaged_over_step(t, dt)` and `linearised_at(t, state)` give the system to be stepped, and differentiated, instead.
+    `compile_bound`: whether a small program is worth more than a fast one: stages are then a loop. `normalised(state)`
+    is what a step leaves, as it must be. `averaged_over_step(t, dt)` and `linearised_at(t, state)` give the system to be
+    stepped, and differentiated, instead.
     """
 
     couples: bool = True
@@ -60,6 +61,7 @@ class SystemTraits(NamedTuple):
     dissipative_symmetric: bool = False
     compile_bound: bool = False
     averaged_over_step: Callable | None = None
+    normalised: Callable | None = None
     linearised_at: Callable | None = None
 
 

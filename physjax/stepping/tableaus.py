@@ -5,6 +5,7 @@ rows a and weights b are the tableau; a pair has other weights of a lower order 
 about the error of a step. Zeros are skipped while tracing: they cost nothing.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -14,14 +15,16 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.loops import Time
-from physjax.stepping.system import S, System, leaf_dtype, read_traits
+from physjax.stepping.pairs import Attempt
+from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
 from physjax.vectors import scale
 
 
 class Tableau(NamedTuple):
     """Nodes, rows, weights [1] and the order of an explicit Runge-Kutta method, row i of length i.
 
-    `errors`, of a pair, are its weights less those of the lower order: what is left is the error of a step.
+    `errors`, of a pair, are its weights less those of the lower order: what is left is the error of a step. `dense`, of a
+    method with an interpolant, has the polynomial Σ p_ij θ^(j+1) for each slope i, its weight at a share θ of a step.
     """
 
     nodes: tuple[float, ...]
@@ -29,6 +32,7 @@ class Tableau(NamedTuple):
     weights: tuple[float, ...]
     order: int
     errors: tuple[float, ...] = ()
+    dense: tuple[tuple[float, ...], ...] = ()
 
     @property
     def first_same_as_last(self) -> bool:
@@ -66,10 +70,13 @@ def move_along(state: S, slopes: list[S], shares: tuple[float, ...], dt: ArrayLi
     return jax.tree.map(move, state, *(k for _, k in used))
 
 
-def _follow_stages(tableau: Tableau, stages: int, system: System, t: Time, state: S, dt: ArrayLike) -> list[S]:
-    """The slopes of the first stages of a step, written out one after the other."""
-    slopes = []
-    for node, row in zip(tableau.nodes[:stages], tableau.rows[:stages], strict=True):
+def _follow_stages(
+    tableau: Tableau, stages: int, system: System, t: Time, state: S, dt: ArrayLike, first: S | None = None
+) -> list[S]:
+    """The slopes of the first stages of a step, written out one after the other; the first of them may be known."""
+    slopes = [] if first is None else [first]
+    known = len(slopes)
+    for node, row in zip(tableau.nodes[known:stages], tableau.rows[known:stages], strict=True):
         slopes.append(system.rate(t + _multiply(node, dt) if node else t, move_along(state, slopes, row, dt)))
     return slopes
 
@@ -97,6 +104,49 @@ def _loop_over_stages(tableau: Tableau, system: System, t: Time, state: S, dt: A
     stages = (jnp.arange(count), jnp.asarray(tableau.nodes[:count], dtype), jnp.asarray(columns, dtype))
     ahead, _ = lax.scan(follow, nothing, stages)
     return jax.tree.map(lambda y, a: y + scale(dt, a[count]), state, ahead)
+
+
+class TableauPair(NamedTuple):
+    """A tableau with `errors` as a pair: the step is that of the higher order, and what the lower would change its error."""
+
+    tableau: Tableau
+
+    @property
+    def error_order(self) -> int:
+        """Of the lower order."""
+        return self.tableau.order - 1
+
+    @property
+    def dense_order(self) -> int:
+        """Of the interpolant; 0 where there is none."""
+        return len(self.tableau.dense[0]) if self.tableau.dense else 0
+
+    @property
+    def keeps_slope(self) -> bool:
+        """Whether the next step may begin with the last slope."""
+        return self.tableau.first_same_as_last
+
+    def attempt(self, system: System, t: Time, state: S, dt: ArrayLike, slope: S | None) -> Attempt:
+        """A step with its error and all its slopes."""
+        system = average_over_step(system, t, dt)
+        slopes = _follow_stages(self.tableau, len(self.tableau.nodes), system, t, state, dt, slope)
+        end = move_along(state, slopes, self.tableau.weights, dt)
+        nothing = jax.tree.map(jnp.zeros_like, state)
+        error = move_along(nothing, slopes, self.tableau.errors, dt)
+        return Attempt(end, error, slopes[-1] if self.keeps_slope else None, slopes)
+
+    def interpolate(self, system: System, t: Time, state: S, dt: ArrayLike, attempt: Attempt, share: ArrayLike) -> S:
+        """The state at a share of a step, from its slopes."""
+        moved = state
+        for polynomial, slope in zip(self.tableau.dense, attempt.stages, strict=True):
+            weight = share * _evaluate_polynomial(polynomial, share)
+            moved = jax.tree.map(lambda y, k, w=weight: y + scale(dt * w, k), moved, slope)
+        return moved
+
+
+def _evaluate_polynomial(coefficients: tuple[float, ...], x: ArrayLike) -> ArrayLike:
+    """Σ c_j x^j, by Horner's rule."""
+    return reduce(lambda total, c: total * x + c, reversed(coefficients[:-1]), coefficients[-1])
 
 
 EULER = Tableau(nodes=(0.0,), rows=((),), weights=(1.0,), order=1)
@@ -142,6 +192,15 @@ TSIT5 = Tableau(
         -0.5823571654525552,
         0.45808210592918686,
         -0.015151515151515152,
+    ),
+    dense=(
+        (1.0, -2.763706197274826, 2.9132554618219126, -1.0530884977290216),
+        (0.0, 0.1317, -0.2234, 0.1017),
+        (0.0, 3.9302962368947516, -5.941033872131505, 2.490627285651253),
+        (0.0, -12.411077166933676, 30.33818863028232, -16.548102889244902),
+        (0.0, 37.50931341651104, -88.1789048947664, 47.37952196281928),
+        (0.0, -27.896526289197286, 65.09189467479366, -34.87065786149661),
+        (0.0, 1.5, -4.0, 2.5),
     ),
 )
 """Ch. Tsitouras, Runge-Kutta pairs of order 5(4), Comput. Math. Appl. 62 (2011) 770."""

@@ -41,8 +41,8 @@ from physjax.physics.contacts.replay import (
 )
 from physjax.physics.contacts.search import Progress, find_events
 from physjax.physics.contacts.surfaces import Surfaces
-from physjax.replays import Record, Replay, differentiate_by_replay, hoist_closures
-from physjax.scene import Scene, trace_once
+from physjax.replays import Record, Replay, differentiate_by_replay, hoist_closures, trace_once
+from physjax.scene import Scene
 from physjax.vectors import scale
 
 Total = TypeVar("Total")

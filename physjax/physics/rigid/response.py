@@ -39,8 +39,8 @@ from physjax.physics.rigid.reactions import (
 )
 from physjax.physics.rigid.replay import REPLAY, fold_legs, record_legs
 from physjax.physics.rigid.spatial import RigidBodies
-from physjax.replays import Record, differentiate_by_replay, hoist_closures
-from physjax.scene import Scene, trace_once
+from physjax.replays import Record, differentiate_by_replay, hoist_closures, trace_once
+from physjax.scene import Scene
 from physjax.vectors import norm
 
 TUNNELLING_DEPTH_SHARE = 0.1

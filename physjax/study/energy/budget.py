@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from physjax.particles import callable_name
-from physjax.scene import Scene, project
+from physjax.scene import Scene, SubdividingMethod, project
 from physjax.study.energy.audit import NUMERICAL, RESPONSE_OBSERVERS, EnergyBudget, audit_run, list_causes
 from physjax.text import format_table
 from physjax.trajectory import Trajectory
@@ -149,6 +149,11 @@ def _demand_audited_scene(run: Trajectory) -> Scene:
                 f"ledger: {type(contact).__name__} has a response of its own, expected one of physjax, whose stages are "
                 "known."
             )
+    if isinstance(run.stepper, SubdividingMethod) and run.scene.resolves_at_step_end:
+        raise ValueError(
+            "ledger: got steps under error control, at the ends of which contacts are projected or springs break, expected equal "
+            "ones, whose stages can be seen. Run with a method of its own, such as methods.rk4 with a small dt."
+        )
     return run.scene
 
 

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from physjax.checks import as_real_quantity, demand_known
 from physjax.compiling import announce_compiling
 from physjax.scene import Scene
-from physjax.stepping.adaptive import Adaptive
 from physjax.stepping.simulate import simulate
 from physjax.trajectory import Trajectory
 from physjax.vectors import dot, norm
@@ -78,7 +77,7 @@ def health(
     error: ArrayLike | None = None,
     size: ArrayLike | None = None,
     fraction: ArrayLike = 0.1,
-    reverse: bool | None = None,
+    reverse: bool = True,
 ) -> GradientHealth:
     """How the sensitivity of a run to its start grows with its length, and until when its gradient can be trusted.
 
@@ -87,8 +86,7 @@ def health(
     ones where there are more. `error` [m] or [m/s] is the error of the start: rounding by default, ε times the largest
     position (velocity); for that of the method give its error over a characteristic time. The horizon is where error
     times sensitivity reaches the `fraction` of `size` [m], by default of the extent of the path at its frames. Reverse
-    mode is compared with it along one random mixture of the frames, unless `reverse=False`; nor by default where it does
-    not exist: under `methods.adaptive` without `tries`, where `jax.grad` raises. Works under vmap and jit. Raises
+    mode is compared with it along one random mixture of the frames, unless `reverse=False`. Works under vmap and jit. Raises
     ValueError or TypeError for bad numbers, as `simulate` does; a run that blows up has an infinite sensitivity from there
     on.
 
@@ -118,7 +116,7 @@ def health(
     law = _fit_growth_law(time, sensitivity)
     horizon = _find_horizon(time, sensitivity, limit, *law)
     mismatch, ok = None, jnp.ones(horizon.shape, bool)
-    if reverse or (reverse is None and not (isinstance(method, Adaptive) and method.tries is None)):
+    if reverse:
         pull = jax.vjp(lambda leaf: positions(leaf)[0], start)[1]
         mismatch, ok, whole = _check_reverse_mode(scene, spread, pull, limit)
         horizon = jnp.where(ok | ~whole, horizon, 0.0)
