@@ -121,6 +121,45 @@ def blind_throw() -> Failure:
     return Failure(scene, blind, 2.0, 1, "error measure", "", None)
 
 
+@failure
+def implicit_midpoint_on_a_swinging_rope(beyond: float = 100.0, newton: int = 20) -> Failure:
+    """A stiff rope that swings, by the implicit midpoint rule at a hundred times verlet's step: its links shake it apart.
+
+    The rule is stable on linear springs at any step, and damps none of their motion. Here links turn within a step, and
+    pull where they no longer point. At 20 times verlet's step it keeps the energy.
+    """
+    rope, longest = _build_swinging_rope(11)
+    method = methods.ImplicitMidpoint(newton=newton)
+    return Failure(rope, method, beyond * longest, 300, "resolution", "Springs", None)
+
+
+@failure
+def tr_bdf2_linearised_once(beyond: float = 100.0, newton: int = 0) -> Failure:
+    """A finer rope by TR-BDF2 with forces linearised once a stage: it damps, and yet gains energy where links turn.
+
+    With the equations solved in full, `newton=20`, a swing keeps 99.9 % of its energy.
+    """
+    rope, longest = _build_swinging_rope(25)
+    method = methods.TrBdf2(newton=newton)
+    return Failure(rope, method, beyond * longest, 1200, "resolution", "Springs", None)
+
+
+def _build_swinging_rope(nodes: int, stiffness: float = 1e6, angle: float = 0.3) -> tuple[Scene, float]:
+    """A rope of 1 m and 1 kg, taut by its weight and let go at an angle [rad], and verlet's longest stable step [s]."""
+    rope = lattices.rope((0.0, 0.0), (0.0, -1.0), nodes, mass=1.0, stiffness=stiffness)
+    carried = 9.8 * np.cumsum(np.asarray(rope.mass)[:0:-1])[::-1]
+    along = np.append(0.0, np.cumsum(np.asarray(rope.springs.rest_length) + carried / stiffness))
+    start = jnp.asarray(along[:, None] * np.array([np.sin(angle), -np.cos(angle)]))
+    scene = Scene(
+        Particles(start, jnp.zeros_like(start)),
+        mass=rope.mass,
+        forces=(forces.Gravity(), rope.springs),
+        pinned=rope.nodes["start"],
+    )
+    # neighbours move against each other at ω = 2√(k/m)
+    return scene, float(np.sqrt(1 / (nodes - 1) / stiffness))
+
+
 def _build_spring(drag: float | None = None) -> Scene:
     parts = () if drag is None else (forces.StokesDrag(drag),)
     return Scene(
