@@ -10,10 +10,10 @@ resumed; `--limit` seconds end it. `--part report` judges and draws what there i
 Promises: on every scene of the gallery and 40 random ones, one search serves three errors; each recommended run is made
 by `.simulate()` and judged by a reference solution other than the search's (a closed form; our own rk4 where the search
 had diffrax; verlet where it had our rk4), and timed in turn with the fastest run of an exhaustive search, steps √2
-apart: of every method of the registry and adaptive rk4 on smooth scenes; of what the search would try first where there
-are contacts, which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ by a percent;
-diffrax's solvers under vmap, each at the loosest of its tolerances, a power of ten apart, that meets the error (Kvaerno5
-only on small scenes; a tenth or twentieth of the duration where a run would take minutes).
+apart: of every method that suits them and the best under error control on smooth scenes; of what the search would try
+first where there are contacts, which take long to compile. Rivals: smooth scenes, 1000 copies whose velocities differ
+by a percent; diffrax's solvers under vmap, each at the loosest of its tolerances, a power of ten apart, that meets the
+error (Kvaerno5 only on small scenes; a tenth or twentieth of the duration where a run would take minutes).
 """
 
 import json
@@ -33,9 +33,8 @@ from random_scenes import random_scene
 
 from physjax import methods
 from physjax.scenes import SCENES
-from physjax.stepping.methods import METHODS
 from physjax.stepping.reference import cast_floats, discontinuities, ode_term
-from physjax.study.accuracy import error_measures, recommend
+from physjax.study.accuracy import error_measures, list_compared_methods, recommend
 from physjax.study.accuracy.compiled_run import compile_run, stack_copies
 from physjax.study.accuracy.method_facts import smallest_size
 from physjax.study.accuracy.recommend import list_candidates
@@ -45,6 +44,8 @@ from physjax.study.problem import Problem
 from physjax.timing import time_repeatedly
 
 ERRORS = (1e-2, 1e-4, 1e-6)
+RIVAL_ERRORS = (*ERRORS, 1e-8, 1e-10)
+"""Against diffrax smaller errors are asked for as well, as far as the truth is known."""
 RANDOM_SCENES = 40
 BATCH = 1000
 SOLVERS = ("Tsit5", "Dopri5", "Dopri8", "Kvaerno5")
@@ -88,9 +89,7 @@ def check_promises(name):
 
 def search_exhaustively(problem, answers):
     """(contender, run) of every method in float64, √2 apart."""
-    entries = [*METHODS.values(), methods.adaptive(methods.rk4)]
-    if not problem.is_ode:
-        entries = list_candidates(problem.scene)[:3]
+    entries = list_compared_methods(problem.scene) if problem.is_ode else list_candidates(problem.scene)[:3]
     slowest = max((a.best.seconds * problem.duration for a in answers if a.ok), default=0.1)
     truth = solve_reference(problem._replace(exact=None), wanted=min(ERRORS))
     task = SearchTask(problem, truth, error_measures.path, None, None, time.process_time() + 30)
@@ -141,10 +140,10 @@ def compare_rivals(name):
         single = cast_floats(problem.scene, jnp.float64)
         duration = DURATION_SHARES.get(name, 1.0) * problem.duration
         many = problem._replace(scene=perturb_copies(single, BATCH), duration=duration, exact=None)
-        asked = {"error": ERRORS, "horizon": many.duration, "frames": many.frames}
+        asked = {"error": RIVAL_ERRORS, "horizon": many.duration, "frames": many.frames}
         answers = recommend(many.scene, seconds=120, progress=False, **asked)
         # a reference other than the search's, where that is diffrax's
-        truth = solve_reference(many, wanted=1e-7, seconds=60.0, own=methods.rk4)
+        truth = solve_reference(many, wanted=min(RIVAL_ERRORS), seconds=60.0, own=methods.dopri8)
         numbers = sum(leaf.size for leaf in jax.tree.leaves(single.state))
         solvers = SOLVERS if numbers <= KVAERNO_STATE_LIMIT else SOLVERS[:-1]
         found = [run for solver in solvers for run in time_rival(single, many, truth, solver)]
@@ -196,7 +195,7 @@ def solve_copies(scene, states, end, tol, size, solver, frames):
 def time_rival(single, many, truth, solver):
     """Error and least time of a solver at tolerances a power of ten apart."""
     runs = []
-    for tol in 10.0 ** -np.arange(2, 12):
+    for tol in 10.0 ** -np.arange(2, 14):
         size = smallest_size(single)
         run = partial(solve_copies, single, many.scene.state, many.duration, tol, size, solver, many.frames)
         states, timing = time_repeatedly(run, 3, longest=SLOW_RUN_SECONDS)
@@ -205,7 +204,7 @@ def time_rival(single, many, truth, solver):
         if not np.isfinite(error):
             continue  # too loose to converge within the steps: a tighter tolerance may, and be faster
         runs.append({"solver": solver, "tolerance": tol, "error": error, "seconds": seconds})
-        if seconds > SLOW_RUN_SECONDS or error < min(ERRORS):
+        if seconds > SLOW_RUN_SECONDS or error < min(RIVAL_ERRORS):
             break
     return runs
 
@@ -280,7 +279,7 @@ def draw(path, kept, against, silent, foot):
 
     figure = Figure(figsize=(13, 5.4), layout="constrained")
     promise, ratio, rival = figure.subplots(1, 3)
-    colours = dict(zip(ERRORS, ("#D55E00", "#009E73", "#0072B2"), strict=True))
+    colours = dict(zip(RIVAL_ERRORS, ("#D55E00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7"), strict=True))
     names = list(dict.fromkeys([*silent, *(name for name, _ in against)]))
     for error, colour in colours.items():
         mine = [row for _, row in kept if row["error"] == error]

@@ -38,7 +38,19 @@ from physjax.timing import Timing, time_in_turn
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "numpy", "numba", "warp-lang", "taichi", "mujoco-mjx")
+PACKAGES = (
+    "jax",
+    "jaxlib",
+    "equinox",
+    "diffrax",
+    "optimistix",
+    "numpy",
+    "numba",
+    "warp-lang",
+    "taichi",
+    "mujoco-mjx",
+    "rebound",
+)
 TURN_SECONDS = 0.5
 """Seconds of a turn."""
 COLOURS = {"physjax": "#0072B2", "other JAX code": "#E69F00", "without JAX": "#999999"}

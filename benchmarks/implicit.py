@@ -1,4 +1,4 @@
-"""Implicit Euler on a stiff cloth: what a frame costs, and what accuracy a second buys, compared with explicit methods.
+"""Implicit methods on a stiff cloth: what a frame costs, what accuracy a second buys, and what is left of a swing.
 
     python benchmarks/implicit.py [--quick] [--out DIR]
 
@@ -7,7 +7,9 @@ structural and shear, 100 bend, two corners pinned, 60 frames a second, float32.
 implicit Euler at a relative residual of 1e-3; (b) the linear system of a frame by our conjugate gradients and by lineax's,
 to the same 2-norm, and its full equation by our Newton method and by optimistix's, in float64: in float32 the rounding
 of the forces is larger than that; (c) error after a quarter of a second against time, for implicit Euler at 1/60 s and
-shorter, and explicit methods from their largest stable step down.
+shorter, and explicit methods from their largest stable step down; (d) the same cloth hung by its upper edge, at rest but
+for an angle of 0.3 rad, in float64: the energy of the swing after each period, and the time of a step, by implicit Euler,
+the implicit midpoint rule and TR-BDF2, linearised once and converged, at multiples of verlet's stable step.
 All run on one core if the process may use one (taskset -c 0).
 """
 
@@ -15,6 +17,7 @@ import math
 import statistics
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,10 +33,25 @@ from physjax.files import write_atomically
 from physjax.stepping.implicit import ImplicitEuler
 from physjax.stepping.krylov import conjugate_gradients
 from physjax.stepping.reference import cast_floats
+from physjax.study.energy.quantities import total
 from physjax.timing import time_call, time_repeatedly
 
 DT, RESIDUAL_TOLERANCE = 1 / 60, 1e-3
 GAME_METHOD = ImplicitEuler(tolerance=RESIDUAL_TOLERANCE)
+SWING_ANGLE, GROWN, SWING_TOLERANCE = 0.3, 1.1, 1e-4
+"""The cloth is let go at this angle [rad]; a run has failed when its swing has grown to so many times its energy."""
+CHAIN_MODE = 2.404825557695773 / 2
+"""ω√(L/g) of the slowest swing of a hanging sheet, half of the first zero of the Bessel function J₀."""
+SWINGERS = {
+    name: kind(tolerance=SWING_TOLERANCE, newton=newton)
+    for name, kind, newton in (
+        ("implicit Euler", methods.ImplicitEuler, 0),
+        ("implicit midpoint", methods.ImplicitMidpoint, 0),
+        ("implicit midpoint, converged", methods.ImplicitMidpoint, 20),
+        ("TR-BDF2", methods.TrBdf2, 0),
+        ("TR-BDF2, converged", methods.TrBdf2, 20),
+    )
+}
 LIU_FRAME_MS = {"their fast solver": 50.0, "Newton": 13_000.0}
 """What Liu et al. report for a frame [ms], on their machine."""
 COLOURS = {"implicit_euler": "#0072B2", "semi_implicit_euler": "#E69F00", "rk4": "#009E73"}
@@ -47,10 +65,12 @@ class Settings(NamedTuple):
     horizon: int
     refinements: int
     repeats: int
+    swing_steps: int
+    swing_multiples: tuple[float, ...]
 
 
-FULL = Settings(81, 90, 15, 5, 5)
-QUICK = Settings(17, 6, 3, 2, 1)
+FULL = Settings(81, 90, 15, 5, 5, 1000, (5.0, 20.0, 100.0))
+QUICK = Settings(17, 6, 3, 2, 1, 120, (20.0, 100.0))
 
 
 def build_cloth(side: int, dtype: DTypeLike = np.float32) -> Scene:
@@ -243,12 +263,93 @@ def measure_work_and_error(scene: Scene, size: Settings, omega: float) -> list[d
     return rows
 
 
-def draw(path: Path, seconds: list[float], rows: list[dict], size: Settings, foot: str) -> None:
-    """Frames by their time, and error against time."""
+def build_swing(side: int) -> tuple[Scene, Scene]:
+    """The cloth hung by its upper edge, at rest, and the same turned about the edge; as stiff as 81 × 81 nodes."""
+    stiff = {"structural": 1000.0, "shear": 1000.0, "bend": 100.0}
+    sheet = lattices.cloth(1.0, 1.0, side, side, mass=1.0, **{name: k * (81 / side) ** 2 for name, k in stiff.items()})
+    mass = jnp.asarray(sheet.mass)
+    hanging = Scene(sheet.state, mass, (forces.Gravity(), sheet.springs), pinned=sheet.nodes["top"])
+    damped = hanging.replace(forces=(*hanging.forces, forces.StokesDrag(20.0 * mass)))
+    x = simulate(damped, ImplicitEuler(tolerance=1e-6), dt=0.05, steps=80, save_every=80).position[-1]
+    c, s = math.cos(SWING_ANGLE), math.sin(SWING_ANGLE)
+    turned = jnp.stack([x[:, 0], c * x[:, 1], -s * x[:, 1]], axis=-1)
+    return tuple(hanging.replace(state=Particles(y, jnp.zeros_like(y))) for y in (x, turned))
+
+
+def measure_swings(size: Settings) -> list[dict]:
+    """The energy of the swing after each period and the median time of a step, by each method at each multiple."""
+    with jax.enable_x64(True):
+        rest, swinging = build_swing(size.side)
+        energy = jax.jit(lambda scene: total(scene, 0.0, scene.state))
+        low, start = float(energy(rest)), float(energy(swinging))
+        limit = 2 / find_largest_frequency(rest)
+        rows = []
+        for times in size.swing_multiples:
+            for name, method in SWINGERS.items():
+                shares, seconds = follow_swing(swinging, method, times * limit, size.swing_steps, energy)
+                shares = (np.asarray(shares) - low) / (start - low)
+                period = 2 * math.pi / (CHAIN_MODE * math.sqrt(9.8)) / (times * limit)
+                at = [round(i * period) for i in range(1, 1 + int(len(shares) / period))]
+                kept = [float(shares[i - 1]) for i in at]
+                failed = bool(len(shares) < size.swing_steps or np.max(shares) > GROWN)
+                row = {"method": name, "multiple": times, "ms": 1e3 * statistics.median(seconds), "failed": failed}
+                rows.append(row | {"steps": len(shares), "kept": kept, "shares": shares.tolist()})
+                after = f"{kept[0]:.4f} after a period" if kept else f"{shares[-1]:.4f} at the end"
+                print_progress(f"  {name} at {times:g}: {row['ms']:.1f} ms, {'failed' if failed else after}")
+    return rows
+
+
+def judge_swings(rows: list[dict]) -> list[Bar]:
+    """What is asked of the methods of second order, where a period was run."""
+    found = {(row["method"], row["multiple"]): row for row in rows}
+    bars = []
+    for name, times in (("TR-BDF2, converged", 100.0), ("implicit midpoint, converged", 20.0)):
+        kept = [1.0, *found[name, times]["kept"]]
+        lost = [1 - after / before for before, after in pairwise(kept)]
+        if lost:
+            bars.append(Bar(f"{name} at {times:g}, most of a swing lost in a period", max(lost), "<=", 0.01))
+        bars.append(Bar(f"{name} at {times:g}, failed", float(found[name, times]["failed"]), "<=", 0.0))
+    for name, times in (("TR-BDF2", 100.0), ("implicit midpoint", 20.0)):
+        ratio = found[name, times]["ms"] / found["implicit Euler", times]["ms"]
+        bars.append(Bar(f"{name} at {times:g}, median step / implicit Euler's", ratio, "<=", 1.5))
+    return bars
+
+
+def follow_swing(
+    scene: Scene, method: Callable, dt: float, steps: int, energy: Callable
+) -> tuple[list[float], list[float]]:
+    """Energy [J] after each step, called separately, and its time [s], until it has grown beyond what can be the swing."""
+    step = partial(simulate, method=method, dt=dt, steps=1)
+    jax.block_until_ready(step(scene).state)
+    energies, seconds, first = [], [], float(energy(scene))
+    for _ in range(steps):
+        flight, taken = time_call(partial(step, scene))
+        scene = flight.final_scene
+        energies.append(float(energy(scene)))
+        seconds.append(taken)
+        if not energies[-1] < first + 10:  # joules, of a swing of 0.2
+            break
+    return energies, seconds
+
+
+def draw_swings(axes, rows: list[dict]) -> None:
+    """The energy of the swing against the number of steps, at the largest multiple."""
+    largest = max(row["multiple"] for row in rows)
+    for row in rows:
+        if row["multiple"] == largest:
+            axes.plot(np.clip(row["shares"], 0, 1.5), label=row["method"] + (" (failed)" if row["failed"] else ""))
+    axes.set(xlabel="step", ylabel="energy of the swing [share]", ylim=(0, 1.3))
+    axes.set_title(f"a swing of 0.3 rad at {largest:g} times verlet's step")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def draw(path: Path, seconds: list[float], rows: list[dict], swings: list[dict], size: Settings, foot: str) -> None:
+    """Frames by their time, error against time, and what is left of a swing."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(16, 4.6), layout="constrained")
+    left, right, last = figure.subplots(1, 3)
+    draw_swings(last, swings)
     ms = 1e3 * np.asarray(seconds)
     left.plot(
         np.arange(1, len(ms) + 1), ms, color=COLOURS["implicit_euler"], label="implicit_euler at 1/60 s, residual 1e-3"
@@ -295,12 +396,16 @@ def main() -> None:
     omega = find_largest_frequency(scene)
     rows = measure_work_and_error(scene, size, omega)
 
+    print_progress("swings")
+    swings = measure_swings(size)
+
     median = 1e3 * statistics.median(seconds)
     allowed = 75.0 if jax.__version_info__ < (0, 11) else 50.0
     bars = [
         Bar("median of the frames [ms]", median, "<=", allowed),
         Bar("largest relative residual of a frame", max(residuals), "<=", RESIDUAL_TOLERANCE),
     ]
+    bars += judge_swings(swings)
     for name, entries in races.items():
         ours, *others = entries
         if not ours["converged"]:
@@ -319,6 +424,18 @@ def main() -> None:
     harness.print_table(
         f"error against time, ω = {omega:.0f} rad/s", ["", "steps a frame", "ms a frame", "error [m]"], cells
     )
+    cells = [
+        [
+            r["method"],
+            r["multiple"],
+            r["ms"],
+            r["steps"],
+            "failed" if r["failed"] else "stable",
+            str(np.round(r["kept"][:4], 4)),
+        ]
+        for r in swings
+    ]
+    harness.print_table("swings", ["", "times verlet's step", "ms a step", "steps", "", "kept after periods"], cells)
     harness.print_bars(bars, quick)
     for name, reason in missing.items():
         print(f"left out: {name}, {reason}")
@@ -330,11 +447,11 @@ def main() -> None:
         "reported_ms": LIU_FRAME_MS,
     }
     record |= {"seconds": seconds, "products": products, "residuals": residuals, "races": races, "left_out": missing}
-    record |= {"largest_frequency": omega, "error_against_time": rows}
+    record |= {"largest_frequency": omega, "error_against_time": rows, "swings": swings}
     record["bars"] = [bar._asdict() | {"met": bar.met} for bar in bars]
     written, drawn = (harness.result_path(folder, "implicit", quick, ending) for ending in ("json", "png"))
     harness.write_json(written, record)
-    draw(drawn, seconds, rows, size, harness.format_caption(about))
+    draw(drawn, seconds, rows, swings, size, harness.format_caption(about))
     print(f"\nwritten: {written} and {drawn.name}")
 
 

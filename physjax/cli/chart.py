@@ -115,14 +115,14 @@ def _study_scene(name: str, folder: Path, quick: bool) -> "tuple[WorkPrecision, 
 
     from physjax.files import write_atomically
     from physjax.scenes import SCENES, title
-    from physjax.stepping.methods import METHODS
     from physjax.study import accuracy
     from physjax.study.report_page import Section, Table, encode_figure
 
     with jax.enable_x64(True):
         problem = SCENES[name]()
     rivals = accuracy.default_rivals() if problem.is_ode else ()
-    with tqdm(total=1 + len(METHODS) + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
+    count = len(accuracy.list_compared_methods(problem.scene))
+    with tqdm(total=1 + count + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
 
         def progress(what: str) -> None:
             bar.set_postfix_str(what)

@@ -3,11 +3,14 @@
 from itertools import product
 from typing import Literal, NamedTuple, Required, TypedDict
 
-from physjax.stepping.methods import METHODS
+from physjax.stepping.methods import METHODS, SPECIAL_METHODS
 
-PALETTE = ("#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3")
-"""Okabe and Ito's colours, which colour-blind readers distinguish too; two more for methods to come."""
-MARKERS = "osD^vPX*"
+PALETTE = (
+    "#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3",
+    "#44AA99", "#882255", "#999933", "#332288", "#AA4499", "#117733", "#661100", "#888888",
+)  # fmt: skip
+"""Okabe and Ito's colours, two more, and Tol's muted ones, which colour-blind readers distinguish as well as may be."""
+MARKERS = "osD^vPXd<>hp8H1|"
 Dashes = Literal["-", "--", "-.", ":"]
 RIVAL_STYLES: dict[str, tuple[str, Dashes]] = {"diffrax Tsit5": ("0.55", "--"), "diffrax Dopri8": ("0.15", "-.")}
 """Grey and line of the solvers of other libraries."""
@@ -64,7 +67,7 @@ def style(
         dtype=named.dtype if dtype is None else dtype,
         adaptive=named.adaptive if adaptive is None else adaptive,
     )
-    if variant.method not in METHODS:
+    if variant.method not in (*METHODS, *SPECIAL_METHODS):
         color, line = RIVAL_STYLES.get(method, ("0.4", ":"))
         return {"color": color, "marker": ".", "linestyle": line, "linewidth": 1.2, "markersize": 5}
     return _style_variant(variant)
@@ -72,12 +75,15 @@ def style(
 
 def _find_variant(name: str) -> Variant:
     """The variant of a registered method with this display name; any other name is that of a rival."""
-    variants = (Variant(*of) for of in product(METHODS, (AS_GIVEN, PROJECTED), ("float64", "float32"), (False, True)))
+    variants = (
+        Variant(*of)
+        for of in product((*METHODS, *SPECIAL_METHODS), (AS_GIVEN, PROJECTED), ("float64", "float32"), (False, True))
+    )
     return next((variant for variant in variants if variant.display_name == name), Variant(name))
 
 
 def _style_variant(variant: Variant) -> LineStyle:
-    place = list(METHODS).index(variant.method)
+    place = [*METHODS, *SPECIAL_METHODS].index(variant.method)
     line: LineStyle = {
         "color": PALETTE[place % len(PALETTE)],
         "marker": MARKERS[place % len(MARKERS)],

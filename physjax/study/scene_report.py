@@ -11,7 +11,7 @@ from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import Scene, project
 from physjax.show import auto_plot
 from physjax.show.style import AS_GIVEN
-from physjax.stepping.methods import METHODS
+from physjax.stepping.methods import METHODS, SPECIAL_METHODS, find_method
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
 from physjax.study.accuracy.recommendation import Recommendation
@@ -53,7 +53,8 @@ class SceneStudy(NamedTuple):
 
         Only of methods that are stable on an undamped oscillator as well: the ablation leaves the damping out.
         """
-        stable = {name for name, method in METHODS.items() if method.promises.stability_limit > 0}
+        known = METHODS | SPECIAL_METHODS
+        stable = {name for name, method in known.items() if method.promises.stability_limit > 0}
         ours = [
             run
             for run in self.precision.runs
@@ -68,7 +69,7 @@ class SceneStudy(NamedTuple):
     def stepping(self) -> Stepping:
         """That run as options of `simulate`."""
         run, problem = self._demand_run(), self.problem
-        steps, method, every = run.steps, METHODS[run.scheme], run.steps // problem.frames
+        steps, method, every = run.steps, find_method(run.scheme), run.steps // problem.frames
         return {"method": method, "dt": problem.duration / steps, "duration": problem.duration, "save_every": every}
 
     @property

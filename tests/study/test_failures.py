@@ -7,8 +7,9 @@ import pytest
 from physjax import Particles, Scene, forces, methods, simulate, stability
 from physjax.scenes import FAILURES, title
 from physjax.scenes.failures import OMEGA
+from physjax.study.energy.quantities import total
 
-SLOW = {"stiff_cloth", "damped_cloth"}
+SLOW = {"stiff_cloth", "damped_cloth", "implicit_midpoint_on_a_swinging_rope", "tr_bdf2_linearised_once"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in FAILURES])
@@ -82,6 +83,32 @@ def test_a_throw_ends_elsewhere_when_the_error_is_blind():
     end = run.run().position[-1]
     exact = jnp.asarray([6.0, 20.0 - 0.5 * 9.8 * 4.0])
     assert float(jnp.linalg.norm(end - exact)) == pytest.approx(4.5, abs=0.6)
+
+
+def measure_swing(run, **numbers):
+    """The energy of a rope that swings, above that of the same rope at rest, as a share of what it starts with."""
+    scene, x = run.scene, np.asarray(run.scene.state.position)
+    hanging = np.stack([0 * x[:, 0], -np.hypot(*x.T)], axis=-1)
+    energy = lambda x, v: float(np.sum(total(scene, 0.0, Particles(jnp.asarray(x), jnp.asarray(v)))))  # noqa: E731
+    rest, start = energy(hanging, 0 * x), energy(x, 0 * x)
+    film = run.run(save_every=run.steps // 10)
+    return np.array([energy(*state) - rest for state in zip(*film.state, strict=True)]) / (start - rest)
+
+
+@pytest.mark.slow
+def test_a_rope_that_swings_breaks_up_under_long_implicit_steps_and_not_under_shorter_ones():
+    midpoint = FAILURES["implicit_midpoint_on_a_swinging_rope"]
+    assert measure_swing(midpoint()).max() > 1e3
+    np.testing.assert_allclose(measure_swing(midpoint(beyond=20.0)), 1.0, rtol=0, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_rope_gains_energy_where_tr_bdf2_is_linearised_once_and_not_where_it_is_solved():
+    linearised = FAILURES["tr_bdf2_linearised_once"]
+    assert measure_swing(linearised()).max() > 1e3
+    kept = measure_swing(linearised(newton=20))
+    assert np.all(np.diff(kept) < 0)
+    assert kept[-1] > 0.99  # after 1200 steps, 15 periods
 
 
 def test_a_sound_run_is_not_accused():

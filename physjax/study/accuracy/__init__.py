@@ -9,7 +9,7 @@ from physjax.study.accuracy.error_measures import energy, final, momentum, outco
 from physjax.study.accuracy.options import QUICK, THOROUGH, TOLERANCES, Budget, Options, SearchOptions
 from physjax.study.accuracy.recommend import recommend
 from physjax.study.accuracy.result import Run, WorkPrecision
-from physjax.study.accuracy.work_precision import default_rivals, work_precision
+from physjax.study.accuracy.work_precision import default_rivals, list_compared_methods, work_precision
 
 __all__ = [
     "QUICK",
@@ -24,6 +24,7 @@ __all__ = [
     "default_rivals",
     "energy",
     "final",
+    "list_compared_methods",
     "momentum",
     "outcome",
     "path",

@@ -56,6 +56,20 @@ class CompiledRun(NamedTuple):
         """Whether it chooses its own steps."""
         return self.variant.adaptive
 
+    @property
+    def error_power(self) -> float:
+        """With which power of the fineness errors should fall."""
+        order = self.promised if np.isfinite(self.promised) else 1.0
+        # a tolerance is on the error of a step: of order p it goes as dt^(p+1)
+        return order * self.work_power if isinstance(self.method, Adaptive) else order
+
+    @property
+    def work_power(self) -> float:
+        """With which power of the fineness the number of steps grows."""
+        if not isinstance(self.method, Adaptive):
+            return 1.0
+        return 1 / (self.method.find_pair(self.scene).error_order + 1)
+
     def count(self, fineness: float) -> int:
         """Steps between two moments."""
         return 1 if self.adaptive else max(1, round(fineness))

@@ -13,9 +13,15 @@ from physjax.particles import callable_name
 from physjax.parts import Function
 from physjax.scene import Scene
 from physjax.show.style import Variant
-from physjax.stepping.adaptive import Adaptive
+from physjax.stepping.adaptive import Adaptive, adaptive
+from physjax.stepping.doubling import Doubling
+from physjax.stepping.methods import METHODS, SPECIAL_METHODS
+from physjax.stepping.pairs import read_pair
 from physjax.stepping.reference import cast_floats
 from physjax.stepping.registry import read_promises
+
+CONTACT_ORDER = 4
+"""The order to which the moment of a touch is found within a step."""
 
 
 def describe_method(method: Callable) -> Variant:
@@ -74,6 +80,31 @@ def _generalised_force(scene: Scene, state: PyTree) -> PyTree:
     return state.generalised_force(scene, jnp.zeros((), state.dtype))
 
 
+def list_methods(scene: Scene) -> dict[str, Callable]:
+    """Methods to be compared on a scene by name: those for any scene, and for forces of place alone also the special ones.
+
+    Of contacts timed within a step the moment is known to order 4: methods of higher order would gain nothing by theirs.
+    """
+    if scene.contacts or scene.emitter is not None:
+        return {name: method for name, method in METHODS.items() if method.promises.order <= CONTACT_ORDER}
+    special = not scene.state.rotates and not depends_on_velocity(scene)
+    return METHODS | SPECIAL_METHODS if special else dict(METHODS)
+
+
+def list_adaptive_methods(scene: Scene) -> list[Adaptive]:
+    """The methods that know the errors of their steps and are made for such a scene, under error control; the best first."""
+    if scene.contacts or scene.emitter is not None:
+        return []
+    pairs = [method for method in list_methods(scene).values() if read_pair(method) is not None]
+    explicit = [method for method in pairs if np.isfinite(method.promises.stability_limit)]
+    # one of fewer evaluations a step is cheaper until errors are tiny; of as many the higher order wins
+    best: list[Callable] = []
+    for method in sorted(explicit, key=lambda m: (m.promises.evaluations, -m.promises.order)):
+        if not best or method.promises.order > best[-1].promises.order:
+            best.append(method)
+    return [adaptive(method) for method in best]
+
+
 def promised_order(method: Callable, velocity_dependent: bool, scene: Scene) -> float:
     """The order that a method promises for a scene; at most 1 where something is resolved at the end of a step."""
     if isinstance(method, Adaptive):
@@ -101,6 +132,18 @@ class _CountingSystem(NamedTuple):
 
     def drift(self, state: PyTree, dt: ArrayLike) -> PyTree:
         return self.scene.drift(state, dt)
+
+
+def count_evaluations_per_try(method: Adaptive, scene: Scene) -> int:
+    """Force evaluations of each step that an adaptive method tries, accepted or not."""
+    pair = method.find_pair(scene) if scene.only_moves else Doubling(method.method, method.order)
+    if isinstance(pair, Doubling):
+        return 3 * count_evaluations(subdivided_method(method), scene)
+    counter = _CountingSystem(scene, [])
+    # a step begins with the last slope of the one before, where that is kept
+    slope = scene.state if pair.keeps_slope else None
+    jax.eval_shape(lambda y, k: pair.attempt(counter, jnp.zeros((), y.dtype), y, 1.0, k), scene.state, slope)
+    return len(counter.calls)
 
 
 def count_evaluations(method: Callable, scene: Scene) -> int:

@@ -14,12 +14,16 @@ from physjax.backend import read_work_clock
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.scene import Scene
-from physjax.stepping.adaptive import adaptive
-from physjax.stepping.methods import METHODS, rk4
 from physjax.stepping.registry import read_promises
 from physjax.study.accuracy.compiled_run import CompiledRun, compile_run, draw_random_push
 from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure, path
-from physjax.study.accuracy.method_facts import depends_on_velocity, method_title, promised_order
+from physjax.study.accuracy.method_facts import (
+    depends_on_velocity,
+    list_adaptive_methods,
+    list_methods,
+    method_title,
+    promised_order,
+)
 from physjax.study.accuracy.options import SearchOptions, merge_options
 from physjax.study.accuracy.reasons import (
     SAFE_ERROR_SHARE,
@@ -50,6 +54,8 @@ REFERENCE_TIME_SHARE = 0.2
 """Share of the search's time that the true path may take, where our own steps are refined for it."""
 FLOAT32_FINENESS_FACTORS = (1.0, 1.25)
 """How much finer than in float64 a run in float32 is tried: its rounding takes a part of the error."""
+ROUGH_ERROR, ROUGH_ORDER = 1e-5, 6
+"""Where no smaller error is asked for, methods of higher order cannot win: their steps are longer than the motion is smooth."""
 LARGEST_COMPARED_LIMIT = 1e6
 """Stands for an infinite stability limit where methods are compared, so that two that are always stable are equals."""
 
@@ -71,7 +77,8 @@ def recommend(
     Errors are relative to the extent of the true path (`norm`: see `accuracy.path` and its neighbours; or your own
     function (times, states)), or in units of `scale`, at `frames` equally spaced moments. The truth is diffrax's Dopri8;
     with contacts, forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson:
-    the answer says which. `methods`: the registry and adaptive rk4, unless given; those that promise no more than another
+    the answer says which. `methods`: the registry, with equal steps and, where
+    they know their errors, with steps of their own, unless given; those that promise no more than another
     in any respect are left out, adaptive ones also where contacts are resolved at the end of a step, implicit ones where
     accuracy limits the step before stability does. `seconds` of processor time (of
     wall-clock time where the work is not on a CPU) bound the search: what is not reached is reported. Everything rarer is
@@ -96,7 +103,7 @@ def recommend(
         push = draw_random_push(scene) if options.gradient else None
         truth = solve_reference(problem, wanted=min(errors), seconds=REFERENCE_TIME_SHARE * seconds, push=push)
         task = SearchTask(problem, truth, norm, options.scale, push, deadline)
-        tried = list_candidates(scene) if methods is None else list(methods)
+        tried = list_candidates(scene, min(errors)) if methods is None else list(methods)
         found, untried = _explore_methods(task, tried, min(errors), bar)
         answers = _answer_errors(task, found, errors, dtypes, untried, bar)
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
@@ -117,8 +124,11 @@ def _check_request(
     return Problem(scene, float(horizon), frames=as_positive_integer("frames", frames)), [float(e) for e in errors]
 
 
-def list_candidates(scene: Scene) -> list[Callable]:
-    """Methods for a scene in the order in which they are tried: the likely winners first, without those that cannot win."""
+def list_candidates(scene: Scene, least: float = 0.0) -> list[Callable]:
+    """Methods for a scene in the order in which they are tried: the likely winners first, without those that cannot win.
+
+    `least` is the smallest error that is asked for.
+    """
     late, velocity_dependent = scene.resolves_at_step_end, depends_on_velocity(scene)
 
     def rate_merit(method: Callable) -> tuple[float, ...]:
@@ -126,14 +136,20 @@ def list_candidates(scene: Scene) -> list[Callable]:
         limit = min(promises.stability_limit, LARGEST_COMPARED_LIMIT)
         return promised_order(method, velocity_dependent, scene), -promises.evaluations, limit
 
+    possible = [m for m in list_methods(scene).values() if m.promises.order <= ROUGH_ORDER or least < ROUGH_ERROR]
     chosen: list[Callable] = []
     # implicit methods do not end by stability and cost more than their promise says: last
-    for method in sorted(METHODS.values(), key=lambda m: (_is_implicit(m), *(-x for x in rate_merit(m)))):
+    for method in sorted(possible, key=lambda m: (_is_implicit(m), *(-x for x in rate_merit(m)))):
         merit = rate_merit(method)
         if not any(all(a >= b for a, b in zip(rate_merit(other), merit, strict=True)) for other in chosen):
             chosen.append(method)
     # adaptive steps cannot see an error that a contact makes at the end of a step
-    return chosen if late else [*chosen[:2], adaptive(rk4), *chosen[2:]]
+    adaptives = (
+        [] if late else [m for m in list_adaptive_methods(scene) if m.order <= ROUGH_ORDER or least < ROUGH_ERROR]
+    )
+    explicit = [method for method in chosen if not _is_implicit(method)]
+    stiff = [method for method in chosen if _is_implicit(method)]
+    return [*adaptives[:1], *explicit, *adaptives[1:], *stiff]
 
 
 def _is_implicit(method: Callable) -> bool:

@@ -25,7 +25,7 @@ from physjax.study.accuracy.compiled_run import (
     stack_copies,
 )
 from physjax.study.accuracy.error_measures import ErrorMeasure, final, path
-from physjax.study.accuracy.method_facts import count_evaluations, smallest_size, subdivided_method
+from physjax.study.accuracy.method_facts import count_evaluations, count_evaluations_per_try, smallest_size
 from physjax.study.accuracy.options import Budget
 from physjax.study.accuracy.reference_solution import ReferenceSolution
 from physjax.study.accuracy.result import Run
@@ -45,8 +45,6 @@ STALLED_ERROR_RATIO = 0.9
 """A refinement that leaves more than this share of the error has brought nothing."""
 LONGEST_TIMING = 4.0
 """Time for all repeats of a run, in those that its budget allows to one."""
-EVALUATIONS_PER_TRIED_STEP = 3
-"""Steps of the method inside an adaptive one for each that it tries: one whole and two halves."""
 
 
 class Errors(TypedDict):
@@ -253,9 +251,10 @@ def _count_effort(entry: CompiledRun, fineness: float) -> Effort:
     measured = count_steps(entry.scene, method, dt=entry.dt(fineness), steps=frames)
     # lanes run in step: the slowest lane of each dt sets the count
     tries = np.asarray(measured.accepted + measured.rejected).reshape(frames, -1).max(axis=1).sum()
-    each = EVALUATIONS_PER_TRIED_STEP * count_evaluations(subdivided_method(method), entry.scene)
-    # and two for the length of the first step of each dt
-    evaluations = int(each * tries + 2 * frames)
+    # and two for the length of the first step: of the run, or of each dt where steps begin anew with it
+    evaluations = int(
+        count_evaluations_per_try(method, entry.scene) * tries + 2 * (1 if entry.scene.only_moves else frames)
+    )
     return {"dt": None, "tolerance": 1 / fineness, "steps": int(tries), "evaluations": evaluations}
 
 

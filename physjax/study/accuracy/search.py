@@ -85,9 +85,7 @@ class Exploration(NamedTuple):
     @property
     def slope(self) -> float:
         """The power of fineness with which errors fall, as observed in the last two runs that are far from rounding."""
-        order = self.compiled_run.promised if np.isfinite(self.compiled_run.promised) else 1.0
-        # the error of a step of order p goes as dt^(p+1): a tolerance on it leaves a global error of its p/(p+1)th power
-        promised = order / (order + 1) if self.compiled_run.adaptive else order
+        promised = self.compiled_run.error_power
         good = [t for t in self.trials if ROUNDING_ERROR < t.error < COARSE_ERROR]
         if len(good) < 2 or good[-1].error >= good[-2].error:
             return promised
@@ -120,8 +118,7 @@ class Exploration(NamedTuple):
         if not np.isfinite(fineness):
             return np.inf
         nearest = min(self.trials, key=lambda t: abs(np.log(t.fineness / fineness)))
-        order = self.compiled_run.promised if np.isfinite(self.compiled_run.promised) else 1.0
-        power = 1 / (order + 1) if self.compiled_run.adaptive else 1.0
+        power = self.compiled_run.work_power
         # towards coarser runs less is saved than steps are: every run has a part that does not depend on them
         power = power if fineness > nearest.fineness else 0.5 * power
         return nearest.seconds * (fineness / nearest.fineness) ** power
@@ -221,6 +218,7 @@ def time_finalists(finalists: Sequence[tuple[CompiledRun, Trial]]) -> list[float
 def estimate_richardson_error(task: SearchTask, entry: CompiledRun, trial: Trial) -> float:
     """Richardson's estimate of a run's error: how much half the step (a tenth of the tolerance) changes it."""
     order = entry.promised if np.isfinite(entry.promised) else 1.0
+    # such that the finer run has 1/2^order of the error, or less
     factor = TOLERANCE_FACTOR ** (1 + 1 / order) if entry.adaptive else STEPS_FACTOR
     here, finer = (jax.tree.map(np.asarray, entry(f)) for f in (trial.fineness, trial.fineness * factor))
     here, finer = ((found if task.push is None else found[0]) for found in (here, finer))

@@ -12,11 +12,10 @@ from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.particles import Particles
 from physjax.scene import Scene
-from physjax.stepping.methods import METHODS
 from physjax.stepping.reference import build_default_solver, cast_floats
 from physjax.study.accuracy.compiled_run import draw_random_push, list_treatments
 from physjax.study.accuracy.error_measures import as_error_measure
-from physjax.study.accuracy.method_facts import method_title
+from physjax.study.accuracy.method_facts import list_adaptive_methods, list_methods, method_title
 from physjax.study.accuracy.options import THOROUGH, Budget, Options, merge_options
 from physjax.study.accuracy.reference_solution import ReferenceSolution, solve_reference
 from physjax.study.accuracy.result import Run, WorkPrecision
@@ -82,12 +81,23 @@ def work_precision(
         detailed = solve_reference(closer, wanted=REFERENCE_ERROR, push=push)
         truth = _pick_frames(detailed)
         comparison = Comparison(problem, truth, norms, budget, dts, options.tolerances, batch)
-        chosen = list(METHODS.values()) if methods is None else list(methods)
+        chosen = list_compared_methods(problem.scene) if methods is None else list(methods)
         runs, slopes, promised = _run_methods(comparison, chosen, options, push)
         for solver in rivals:
             options.progress(f"diffrax {type(solver).__name__}")
             runs += run_rival(comparison, cast_floats(problem.scene, _list_dtypes(options)[0]), solver)
     return _gather_result(comparison, detailed, options, runs, slopes, promised)
+
+
+def list_compared_methods(scene: Scene) -> list[Callable]:
+    """What is compared where no methods are given: all that a scene may be stepped by, and the best under error control.
+
+    Example:
+        >>> compared = accuracy.list_compared_methods(swing)
+        >>> methods.verlet in compared, methods.dprkn6 in compared
+        (True, True)
+    """
+    return [*list_methods(scene).values(), *list_adaptive_methods(scene)[:1]]
 
 
 def _run_methods(

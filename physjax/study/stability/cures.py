@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from physjax.particles import Particles
 from physjax.scene import Scene
-from physjax.stepping.implicit import ImplicitEuler
+from physjax.stepping.implicit import ImplicitMethod
 from physjax.stepping.methods import METHODS
 from physjax.stepping.registry import read_promises
 from physjax.study.stability.limits import Limit, limit
@@ -38,7 +38,7 @@ def list_cures(scene: Scene, method: Callable, dt: float, worst: Limit, state: P
     for name, other in METHODS.items():
         longest = min(SAFE_LIMIT_SHARE * limit(scene, other, at=state).dt, dt) if other is not method else 0.0
         if longest > 0:
-            solves = isinstance(other, ImplicitEuler)
+            solves = isinstance(other, ImplicitMethod)
             evaluations = EVALUATIONS_PER_SOLVE if solves else other.promises.evaluations
             others.append((evaluations / longest, longest, name, solves))
     for cost, longest, name, solves in sorted(others)[: 2 - len(cures)]:

@@ -80,7 +80,8 @@ def test_the_orientation_has_the_order_that_the_method_promises(name, method):
     order = promises.order_with_drag if name == "with drag" else promises.order
     if name == "free":
         order = WITHOUT_TORQUE.get(method, order)
-    found = errors(name, METHODS[method], (200, 400))
+    # of a high order rounding is all that is left of the error of short steps
+    found = errors(name, METHODS[method], (12, 24) if order > 5 else (200, 400))
     assert np.log2(found[0] / found[1]) == pytest.approx(order, abs=0.3)
     assert found[1] < (0.3 if order == 1 else 1e-3)
 
