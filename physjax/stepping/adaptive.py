@@ -182,10 +182,11 @@ class Adaptive(eqx.Module):
         rounding = 16 * float(jnp.finfo(dt.dtype).eps) * dt
         course = course._replace(
             attempt=attempt,
-            measure=lambda start, tried: scaled_norm(
-                tried.error, self._tolerance.at(start.state, tried.end.state), dt.shape
+            measure=lambda start, tried: self._measure_error(
+                start.state, tried._replace(end=tried.end.state), dt.shape
             ),
             normalise=lambda moving: moving,
+            choose_factor=partial(self._choose_factor, order=self.order),
             # what comes late is cured by short steps alone
             floor=course.floor if self.dt_min is not None else rounding,
         )

@@ -383,3 +383,20 @@ def test_balls_that_are_tied_bounce_within_a_dt():
     down = np.sqrt(2 / 9.8)
     since = 1.2 - 2.6 * down
     np.testing.assert_allclose(run.position[-1, :, 1], 0.64 * 9.8 * down * since - 4.9 * since**2, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", [methods.tsit5, methods.rk4])
+def test_alone_in_a_batch_and_under_vmap_lanes_take_the_same_steps(method):
+    chooser, omega = methods.adaptive(method, 1e-6, 1e-6), jnp.asarray([1.0, 3.0, 10.0])
+
+    def run(stiffness):
+        shape = (*stiffness.shape, 1)
+        spring = forces.Anchor(point=jnp.zeros(1), stiffness=stiffness)
+        scene = Scene(Particles(jnp.ones(shape), jnp.zeros(shape)), forces=(spring, forces.StokesDrag(0.1)))
+        return simulate(scene, chooser, dt=0.25, steps=8).position
+
+    together = run(omega**2)
+    alone = jnp.stack([run(k) for k in omega**2], axis=1)
+    np.testing.assert_allclose(together, alone, rtol=1e-12, atol=1e-14)
+    mapped = jax.vmap(run, out_axes=1)(omega**2)
+    np.testing.assert_allclose(mapped, alone, rtol=1e-12, atol=1e-14)

@@ -54,6 +54,8 @@ REFERENCE_TIME_SHARE = 0.2
 """Share of the search's time that the true path may take, where our own steps are refined for it."""
 FLOAT32_FINENESS_FACTORS = (1.0, 1.25)
 """How much finer than in float64 a run in float32 is tried: its rounding takes a part of the error."""
+MIN_NUMBERS_FOR_FLOAT32 = 64
+"""Numbers in a state below which a step takes as long in either precision: a vector register or a few."""
 ROUGH_ERROR, ROUGH_ORDER = 1e-5, 6
 """Where no smaller error is asked for, methods of higher order cannot win: their steps are longer than the motion is smooth."""
 LARGEST_COMPARED_LIMIT = 1e6
@@ -239,9 +241,15 @@ def _verify_finalists(
         most = min(most, FINALIST_TIME_RATIO * trial.seconds)
         if "float64" in dtypes:
             kept.append((found[i].compiled_run, trial))
-        if "float32" in dtypes and is_float32_accurate(task, wanted):
+        # of a few numbers float32 saves nothing that compiling another program would not cost
+        worth = "float64" not in dtypes or _count_numbers(task.problem.scene) >= MIN_NUMBERS_FOR_FLOAT32
+        if "float32" in dtypes and worth and is_float32_accurate(task, wanted):
             kept += _try_float32(task, found[i], trial, goals["float32"], compiled)
     return kept
+
+
+def _count_numbers(scene: Scene) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(scene.state))
 
 
 def _try_float32(

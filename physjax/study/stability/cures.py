@@ -12,6 +12,8 @@ from physjax.text import format_seconds
 
 EVALUATIONS_PER_SOLVE = 20
 """Force evaluations that a linear solve is worth when methods are compared: conjugate gradients take some dozens of products."""
+MIN_LIMIT_PER_EVALUATION = 0.5
+"""Stability limit of ω·dt for each force evaluation: methods with less are made for accuracy, not for stiffness."""
 SAFE_LIMIT_SHARE = 0.9
 """The share of a limit that a cure recommends: limits move with the state."""
 RESOLVED_RATE_STEP = 0.1
@@ -36,6 +38,8 @@ def list_cures(scene: Scene, method: Callable, dt: float, worst: Limit, state: P
         cures.append(f"dt = {format_seconds(safe)}, {dt / safe:.3g} times the cost")
     others = []
     for name, other in METHODS.items():
+        if other.promises.stability_limit < MIN_LIMIT_PER_EVALUATION * other.promises.evaluations:
+            continue
         longest = min(SAFE_LIMIT_SHARE * limit(scene, other, at=state).dt, dt) if other is not method else 0.0
         if longest > 0:
             solves = isinstance(other, ImplicitMethod)
