@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 
 from physjax.particles import callable_name
 from physjax.parts import Function
+from physjax.programs import iterate_operations
 from physjax.scene import Scene
 from physjax.show.style import Variant
 from physjax.stepping.adaptive import Adaptive, adaptive
@@ -20,6 +21,8 @@ from physjax.stepping.pairs import read_pair
 from physjax.stepping.reference import cast_floats
 from physjax.stepping.registry import read_promises
 
+COUNTED_RATE = "counted_rate"
+"""What an evaluation of the right-hand side is called in the program of a step."""
 CONTACT_ORDER = 4
 """The order to which the moment of a touch is found within a step."""
 
@@ -125,7 +128,12 @@ class _CountingSystem(NamedTuple):
 
     def rate(self, t: ArrayLike, state: PyTree) -> PyTree:
         self.calls.append(t)
-        return self.scene.rate(t, state)
+
+        def evaluate(t: ArrayLike, state: PyTree) -> PyTree:
+            return self.scene.rate(t, state)
+
+        evaluate.__name__ = COUNTED_RATE
+        return jax.jit(evaluate)(t, state)
 
     def kick(self, state: PyTree, rate: PyTree, dt: ArrayLike) -> PyTree:
         return self.scene.kick(state, rate, dt)
@@ -139,11 +147,16 @@ def count_evaluations_per_try(method: Adaptive, scene: Scene) -> int:
     pair = method.find_pair(scene) if scene.only_moves else Doubling(method.method, method.order)
     if isinstance(pair, Doubling):
         return 3 * count_evaluations(subdivided_method(method), scene)
+    promises = read_promises(subdivided_method(method))
+    if promises is not None and np.isinf(promises.stability_limit):
+        return promises.evaluations  # the products of its solves are no evaluations
     counter = _CountingSystem(scene, [])
     # a step begins with the last slope of the one before, where that is kept
     slope = scene.state if pair.keeps_slope else None
-    jax.eval_shape(lambda y, k: pair.attempt(counter, jnp.zeros((), y.dtype), y, 1.0, k), scene.state, slope)
-    return len(counter.calls)
+    attempt = lambda y, k: pair.attempt(counter, jnp.zeros((), y.dtype), y, 1.0, k)  # noqa: E731
+    # in the program: a method may trace the forces once more, to see what they depend on
+    operations = iterate_operations(jax.make_jaxpr(attempt)(scene.state, slope).jaxpr)
+    return sum(operation.params.get("name") == COUNTED_RATE for operation in operations)
 
 
 def count_evaluations(method: Callable, scene: Scene) -> int:
