@@ -120,8 +120,8 @@ def _study_scene(name: str, folder: Path, quick: bool) -> "tuple[WorkPrecision, 
 
     with jax.enable_x64(True):
         problem = SCENES[name]()
+        count = len(accuracy.list_compared_methods(problem.scene))
     rivals = accuracy.default_rivals() if problem.is_ode else ()
-    count = len(accuracy.list_compared_methods(problem.scene))
     with tqdm(total=1 + count + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
 
         def progress(what: str) -> None:
