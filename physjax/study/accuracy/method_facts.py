@@ -86,10 +86,12 @@ def _generalised_force(scene: Scene, state: PyTree) -> PyTree:
 def list_methods(scene: Scene) -> dict[str, Callable]:
     """Methods to be compared on a scene by name: those for any scene, and for forces of place alone also the special ones.
 
-    Of contacts timed within a step the moment is known to order 4: methods of higher order would gain nothing by theirs.
+    Of contacts timed within a step the moment is known to order 4: methods of higher order would gain nothing by theirs. Nor
+    do implicit ones of order 2 by taking longer steps, and their solves are part of every leg.
     """
     if scene.contacts or scene.emitter is not None:
-        return {name: method for name, method in METHODS.items() if method.promises.order <= CONTACT_ORDER}
+        suits = lambda promises: promises.order <= (1 if np.isinf(promises.stability_limit) else CONTACT_ORDER)  # noqa: E731
+        return {name: method for name, method in METHODS.items() if suits(method.promises)}
     special = not scene.state.rotates and not depends_on_velocity(scene)
     return METHODS | SPECIAL_METHODS if special else dict(METHODS)
 
