@@ -264,7 +264,7 @@ def differentiable_while_loop(going: Callable[[T], Array], turn: Callable[[T], T
             start = turn(start)
         return start
     # what they close over may be differentiated as well
-    (go, known), (move, closed_over) = _open_closure(going, start), _open_closure(turn, start)
+    (go, known), (move, closed_over) = open_closure(going, start), open_closure(turn, start)
 
     @jax.custom_jvp
     def run(known: list, closed_over: list, start: T) -> T:
@@ -282,13 +282,14 @@ def differentiable_while_loop(going: Callable[[T], Array], turn: Callable[[T], T
     return run(known, closed_over, start)
 
 
-def _open_closure(function: Callable[[T], PyTree], example: T) -> tuple[Callable[[list, T], PyTree], list]:
+def open_closure(function: Callable, *examples: PyTree) -> tuple[Callable, list]:
     """The function with what it closes over as its first argument, and that."""
-    closed, shape = jax.make_jaxpr(function, return_shape=True)(example)
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*examples)
     structure = jax.tree.structure(shape)
 
-    def opened(known: list, carry: T) -> PyTree:
-        return structure.unflatten(jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, known))(*jax.tree.leaves(carry)))
+    def opened(numbers: list, *arguments: PyTree) -> PyTree:
+        program = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, numbers))
+        return structure.unflatten(program(*jax.tree.leaves(arguments)))
 
     return opened, list(closed.consts)
 

@@ -15,12 +15,12 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.tree_util import Partial
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, PyTree
 
 from physjax.backend import any_lane
+from physjax.loops import open_closure
 from physjax.vectors import scale
 
 
@@ -169,7 +169,7 @@ def hoist_closures(
     numbers: list[list] = []
 
     def hoist(function: Callable, *first: PyTree) -> Callable:
-        opened, closed_over = _open_closure(function, *first, *arguments)
+        opened, closed_over = open_closure(function, *first, *arguments)
         place, count = len(numbers), len(first)
         numbers.append(closed_over)
         return lambda *given: opened(given[count][place], *given[:count], *given[count + 1 :])
@@ -182,15 +182,3 @@ def hoist_closures(
         respond=hoist(replay.respond, choices, prepared, duration, end),
     )
     return differentiate_by_replay(find, log, flown, numbers, *arguments)
-
-
-def _open_closure(function: Callable, *examples: PyTree) -> tuple[Callable, list]:
-    """The function with what it closes over as its first argument, and that."""
-    closed, shape = jax.make_jaxpr(function, return_shape=True)(*examples)
-    structure = jax.tree.structure(shape)
-
-    def opened(numbers: list, *arguments: PyTree) -> PyTree:
-        program = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, numbers))
-        return structure.unflatten(program(*jax.tree.leaves(arguments)))
-
-    return opened, list(closed.consts)

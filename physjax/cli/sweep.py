@@ -38,12 +38,12 @@ def _run_sweep(options: argparse.Namespace) -> None:
     from physjax.checks import demand_known
     from physjax.files import ensure_writable_folder, write_atomically
     from physjax.scenes import SCENES
-    from physjax.stepping.methods import METHODS, SPECIAL_METHODS, find_method
+    from physjax.stepping.methods import find_method, list_all_methods
     from physjax.study.sweeps.observables import OBSERVABLES, sweep_scene
 
     build = SCENES[demand_known("scene", options.scene, SCENES)]
     outcome = demand_known("outcome", options.outcome, OBSERVABLES)
-    method = find_method(demand_known("method", options.method, (*METHODS, *SPECIAL_METHODS)))
+    method = find_method(demand_known("method", options.method, list_all_methods()))
     axes = dict(_parse_range(text) for text in options.over)
     folder = ensure_writable_folder(options.out)
     matplotlib.use("Agg")

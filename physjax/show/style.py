@@ -3,7 +3,7 @@
 from itertools import product
 from typing import Literal, NamedTuple, Required, TypedDict
 
-from physjax.stepping.methods import METHODS, SPECIAL_METHODS
+from physjax.stepping.methods import list_all_methods
 
 PALETTE = (
     "#D55E00", "#E69F00", "#009E73", "#0072B2", "#56B4E9", "#CC79A7", "#8C6D31", "#6A51A3",
@@ -67,7 +67,7 @@ def style(
         dtype=named.dtype if dtype is None else dtype,
         adaptive=named.adaptive if adaptive is None else adaptive,
     )
-    if variant.method not in (*METHODS, *SPECIAL_METHODS):
+    if variant.method not in list_all_methods():
         color, line = RIVAL_STYLES.get(method, ("0.4", ":"))
         return {"color": color, "marker": ".", "linestyle": line, "linewidth": 1.2, "markersize": 5}
     return _style_variant(variant)
@@ -76,14 +76,13 @@ def style(
 def _find_variant(name: str) -> Variant:
     """The variant of a registered method with this display name; any other name is that of a rival."""
     variants = (
-        Variant(*of)
-        for of in product((*METHODS, *SPECIAL_METHODS), (AS_GIVEN, PROJECTED), ("float64", "float32"), (False, True))
+        Variant(*of) for of in product(list_all_methods(), (AS_GIVEN, PROJECTED), ("float64", "float32"), (False, True))
     )
     return next((variant for variant in variants if variant.display_name == name), Variant(name))
 
 
 def _style_variant(variant: Variant) -> LineStyle:
-    place = [*METHODS, *SPECIAL_METHODS].index(variant.method)
+    place = list(list_all_methods()).index(variant.method)
     line: LineStyle = {
         "color": PALETTE[place % len(PALETTE)],
         "marker": MARKERS[place % len(MARKERS)],

@@ -73,8 +73,12 @@ class Adaptive(eqx.Module):
     tries: int | None = eqx.field(static=True)
 
     def find_pair(self, system: System) -> Pair:
-        """What knows the error of a step: the method's own pair, or the method taken twice."""
-        found = None if self.error == "velocity" else read_pair(self.method)
+        """What knows the error of a step: the method's own pair, or the method taken twice.
+
+        Where contacts act after each step or memories advance, no pair knows what they do to the error.
+        """
+        alone = not isinstance(system, Scene) or system.only_moves or system.emitter is not None
+        found = read_pair(self.method) if alone and self.error != "velocity" else None
         forces = [force for force in read_traits(system).forces if isinstance(force, Force) and force.jumps]
         # to a pair, the mean of a force over a step is a constant: what it jumps by it cannot see
         unseen = any(not force.discontinuities() for force in forces)
@@ -186,7 +190,6 @@ class Adaptive(eqx.Module):
                 start.state, tried._replace(end=tried.end.state), dt.shape
             ),
             normalise=lambda moving: moving,
-            choose_factor=partial(self._choose_factor, order=self.order),
             # what comes late is cured by short steps alone
             floor=course.floor if self.dt_min is not None else rounding,
         )
@@ -302,9 +305,9 @@ def adaptive(
     `error="velocity"` is the lecture's E = |v₁ - v₂| / atol, the next step 0.9 E^(-1/2) times as long. It cannot see
     position: under gravity alone it is 0, and a throw of 2 s by Euler ends metres off. A step rejected at `dt_min` [s]
     (a millionth of dt, if not given) ends that lane as NaN: see `.ok` and `.first_bad_step` of a run. `tries` bounds
-    the steps of one dt; where more are needed, the state is NaN. Derivatives, forward and reverse, are those of the steps
-    taken, up to 16 384 of them in one dt, beyond which they are NaN. Symplectic methods (semi-implicit Euler, verlet,
-    leapfrog) lose their bounded energy: with steps that depend on the state it drifts.
+    the steps between two frames; where more are needed, the state is NaN. Derivatives, forward and reverse, are those of the
+    steps taken, up to 16 384 of them between two frames, beyond which they are NaN. Symplectic methods (semi-implicit
+    Euler, verlet, leapfrog) lose their bounded energy: with steps that depend on the state it drifts.
 
     Example:
         >>> careful = methods.adaptive(methods.rk4, atol=1e-5, rtol=1e-5)

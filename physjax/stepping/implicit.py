@@ -17,12 +17,13 @@ from jaxtyping import PyTree
 
 from physjax.loops import Time
 from physjax.scene import Scene
+from physjax.stepping.dependence import find_kicked
 from physjax.stepping.implicit_solution import SMALLEST_FORCING_TERM, StageSolver
-from physjax.stepping.implicit_stage import Linearised, Stage, add_change, build_stage, find_kicked_leaves, take_kick
+from physjax.stepping.implicit_stage import Linearised, Stage, add_change, build_stage, take_kick
 from physjax.stepping.krylov import SolveReport, Vector
 from physjax.stepping.pairs import Attempt
 from physjax.stepping.registry import Promises
-from physjax.stepping.system import S, System, average_over_step, leaf_dtype
+from physjax.stepping.system import S, System, average_over_step, leaf_dtype, push_drift
 from physjax.vectors import scale
 
 DIAGONAL = 1 - 2**0.5 / 2
@@ -97,8 +98,8 @@ class ImplicitEuler(ImplicitMethod):
     def solve_step(self, system: System, t: Time, state: S, dt: ArrayLike) -> tuple[S, SolveReport]:
         """The state after a step dt [s] from the time t [s], and how it was solved."""
         h = jnp.asarray(dt, leaf_dtype(state))
-        way, free = _push_drift(system, state, h), system.drift(state, h)
-        stage = Stage(system, t + dt, state, h, state, way, free, find_kicked_leaves(system, state))
+        way, free = push_drift(system, state, 0.0, h), system.drift(state, h)
+        stage = Stage(system, t + dt, state, h, state, way, free, find_kicked(system, state))
         u, reported = self._solver.solve(stage, stage.linearise())
         return stage.end_state(u), reported
 
@@ -186,7 +187,7 @@ class TrBdf2(ImplicitMethod):
     ) -> tuple[S, tuple[S, S], tuple[tuple[Vector, ...], Linearised], SolveReport]:
         """The end, the ends of both stages, the kicks h·K f of the three slopes with the last matrix, and the report."""
         h, across = DIAGONAL * dt, WEIGHT * dt
-        kicked = find_kicked_leaves(system, state)
+        kicked = find_kicked(system, state)
         first = take_kick(system, state, system.rate(t, state) if slope is None else slope, h, kicked)
         trapezoid = _build_trapezoid(system, t, state, jnp.asarray(h, leaf_dtype(state)), first, kicked)
         second, reported = self._solver.solve(trapezoid, trapezoid.linearise())
@@ -209,7 +210,7 @@ class TrBdf2(ImplicitMethod):
         Unfiltered it would be that of stiff motion which the step damps, and grow with the stiffness.
         """
         stage, system = last.stage, last.stage.system
-        drifted = [_push_drift(system, y, weight * dt) for y, weight in zip(states, ERROR_WEIGHTS, strict=True)]
+        drifted = [push_drift(system, y, 0.0, weight * dt) for y, weight in zip(states, ERROR_WEIGHTS, strict=True)]
         moved = reduce(lambda a, b: jax.tree.map(jnp.add, a, b), drifted)
         shares = [weight / DIAGONAL for weight in ERROR_WEIGHTS]
         kicked = [
@@ -220,7 +221,7 @@ class TrBdf2(ImplicitMethod):
         return jax.tree.map(jnp.add, moved, last.move(w))
 
 
-def _build_trapezoid(system: System, t: Time, state: PyTree, h: jax.Array, kick: Vector, kicked: tuple) -> Stage:
+def _build_trapezoid(system: System, t: Time, state: PyTree, h: jax.Array, kick: Vector, kicked: list[bool]) -> Stage:
     """The trapezoidal rule over 2h: half of it by the force at the start, whose `kick` is known, half by that at the end.
 
     Linearised at the end of a free drift: the force at the start may be that of stiff springs, which the end damps.
@@ -230,12 +231,6 @@ def _build_trapezoid(system: System, t: Time, state: PyTree, h: jax.Array, kick:
         lambda u: system.drift(add_change(middle, u, kicked), h), ([jnp.zeros_like(u) for u in kick],), (kick,)
     )
     return Stage(system, t + 2 * h, add_change(middle, kick, kicked), h, near, way, near, kicked)
-
-
-def _push_drift(system: System, state: PyTree, dt: ArrayLike) -> PyTree:
-    """The rate at which a state drifts, times dt: what is not drifted is zero."""
-    h = jnp.asarray(dt, leaf_dtype(state))
-    return jax.jvp(lambda h: system.drift(state, h), (jnp.zeros_like(h),), (h,))[1]
 
 
 def _join_reports(first: SolveReport, second: SolveReport) -> SolveReport:

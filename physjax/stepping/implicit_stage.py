@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.loops import Time
+from physjax.stepping.dependence import find_kicked, pick_leaves
 from physjax.stepping.krylov import Vector
 from physjax.stepping.system import System, has_no_lanes, leaf_dtype, linearise_at, read_traits
 from physjax.vectors import scale
@@ -52,7 +53,7 @@ class Stage(NamedTuple):
     near: PyTree
     way: PyTree | None
     free: PyTree
-    kicked_leaves: tuple[bool, ...]
+    kicked_leaves: list[bool]
 
     @property
     def is_independent(self) -> bool:
@@ -81,7 +82,7 @@ class Stage(NamedTuple):
 
     def zero_change(self) -> Vector:
         """No change."""
-        return [jnp.zeros_like(leaf) for leaf in select_kicked(self.base, self.kicked_leaves)]
+        return [jnp.zeros_like(leaf) for leaf in pick_leaves(self.base, self.kicked_leaves)]
 
     def mask_held(self, u: Vector) -> Vector:
         """u with zero for held lanes, which do not move: the matrix is then symmetric in them as well."""
@@ -118,34 +119,15 @@ def build_stage(system: System, time: Time, base: PyTree, h: ArrayLike) -> Stage
     """A stage that is linearised where it ends without its force, drift(base, h)."""
     h = jnp.asarray(h, leaf_dtype(base))
     free = system.drift(base, h)
-    return Stage(system, time, base, h, free, None, free, find_kicked_leaves(system, base))
+    return Stage(system, time, base, h, free, None, free, find_kicked(system, base))
 
 
-def find_kicked_leaves(system: System, state: PyTree) -> tuple[bool, ...]:
-    """Which leaves of a state a kick changes: found by tracing it and comparing identities."""
-    kicked_leaves = []
-
-    def kick(state: PyTree) -> PyTree:
-        after = system.kick(state, state, 1.0)
-        pairs = zip(jax.tree.leaves(state), jax.tree.leaves(after), strict=True)
-        kicked_leaves.extend(before is not now for before, now in pairs)
-        return after
-
-    jax.eval_shape(kick, state)
-    return tuple(kicked_leaves)
-
-
-def select_kicked(tree: PyTree, kicked_leaves: tuple[bool, ...]) -> Vector:
-    """The leaves of a state that a kick changes."""
-    return [leaf for leaf, place in zip(jax.tree.leaves(tree), kicked_leaves, strict=True) if place]
-
-
-def take_kick(system: System, state: PyTree, rate: PyTree, h: ArrayLike, kicked_leaves: tuple[bool, ...]) -> Vector:
+def take_kick(system: System, state: PyTree, rate: PyTree, h: ArrayLike, kicked_leaves: list[bool]) -> Vector:
     """h·rate, of the leaves that a kick changes."""
-    return select_kicked(system.kick(jax.tree.map(jnp.zeros_like, state), rate, h), kicked_leaves)
+    return pick_leaves(system.kick(jax.tree.map(jnp.zeros_like, state), rate, h), kicked_leaves)
 
 
-def add_change(state: PyTree, u: Vector, kicked_leaves: tuple[bool, ...]) -> PyTree:
+def add_change(state: PyTree, u: Vector, kicked_leaves: list[bool]) -> PyTree:
     """The state with u added to what a kick changes."""
     leaves, tree = jax.tree.flatten(state)
     more = iter(u)

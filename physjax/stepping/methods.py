@@ -14,7 +14,7 @@ from physjax.stepping.adaptive import adaptive, count_steps
 from physjax.stepping.compositions import BLANES_MOAN_4, KAHAN_LI_8, compose_leapfrogs, take_split_step
 from physjax.stepping.implicit import ImplicitEuler, ImplicitMidpoint, TrBdf2
 from physjax.stepping.nystrom import DPRKN6, NystromPair, take_nystrom_step
-from physjax.stepping.registry import METHODS, SPECIAL_METHODS, Promises, find_method, promises
+from physjax.stepping.registry import METHODS, SPECIAL_METHODS, Promises, find_method, list_all_methods, promises
 from physjax.stepping.system import S, System
 from physjax.stepping.tableaus import DOPRI8, EULER, HEUN, MIDPOINT, RK4, TSIT5, TableauPair, take_step
 from physjax.stepping.time_scaled import time_scaled
@@ -219,6 +219,7 @@ __all__ = [
     "implicit_midpoint",
     "kahan_li8",
     "leapfrog",
+    "list_all_methods",
     "midpoint",
     "promises",
     "rk4",

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from physjax.loops import Time
 from physjax.stepping.dependence import find_dependent, find_kicked, name_forces_of_velocity, pick_leaves
 from physjax.stepping.pairs import Attempt
-from physjax.stepping.system import S, System, average_over_step, leaf_dtype
+from physjax.stepping.system import S, System, average_over_step, leaf_dtype, push_drift
 from physjax.vectors import scale
 
 Share = float | Array
@@ -135,7 +135,7 @@ class _Moves(NamedTuple):
 
     def complete_rate(self, state: S, found: list[Array]) -> S:
         """The rate of a state whose accelerations are known: that of the places is how they drift."""
-        return self.fill(_differentiate_drift(self.system, state, jnp.zeros((), leaf_dtype(state))), found)
+        return self.fill(push_drift(self.system, state, 0.0, 1.0), found)
 
 
 def take_nystrom_step(tableau: NystromTableau, system: System, t: Time, state: S, dt: ArrayLike) -> S:
@@ -145,7 +145,7 @@ def take_nystrom_step(tableau: NystromTableau, system: System, t: Time, state: S
 
 def _demand_straight_drift(system: System, state: Any, kicked: list[bool]) -> None:
     """Raise a ValueError where what drifts does so in a way that depends on where it is, as orientations in space."""
-    drift = lambda y, h: _differentiate_drift(system, y, h)  # noqa: E731
+    drift = lambda y, h: push_drift(system, y, h, 1.0)  # noqa: E731
     places = [not mark for mark in kicked]
     if any(find_dependent(drift, state, jnp.zeros((), leaf_dtype(state)), marked=[*places, True])):
         raise ValueError(
@@ -162,11 +162,6 @@ def _demand_forces_of_place(system: System, t: Time, state: Any, kicked: list[bo
             f"Nyström method: got forces that look at the velocity ({names}), expected x'' = f(t, x), forces of place and time "
             "alone. Use a method for forces of any kind, such as methods.tsit5 or methods.dopri8."
         )
-
-
-def _differentiate_drift(system: System, state: S, elapsed: Array) -> S:
-    """How fast each array of a state drifts, after some time [s] of it."""
-    return jax.jvp(lambda h: system.drift(state, h), (elapsed,), (jnp.ones_like(elapsed),))[1]
 
 
 def _subtract(these: Sequence[Share], those: Sequence[Share]) -> list[Share]:

@@ -1,4 +1,4 @@
-"""What a method may offer beside its step: the error of each step, and a memory that lives from step to step.
+"""What a method may offer besides its step: the error of each step, and a memory that lives from step to step.
 
 A pair knows the error of a step from the slopes that it computes anyway, and the path within it. A method with a memory
 goes its own way and is read at the ends of dt: simulate carries the memory, and nobody else sees it.

@@ -18,7 +18,17 @@ def find_method(name: str) -> Callable:
         >>> methods.find_method("rk4") is methods.rk4
         True
     """
-    return (METHODS | SPECIAL_METHODS)[name]
+    return list_all_methods()[name]
+
+
+def list_all_methods() -> dict[str, Callable]:
+    """Every method by name, the special ones last.
+
+    Example:
+        >>> {"rk4", "dprkn6"} <= set(methods.list_all_methods())
+        True
+    """
+    return METHODS | SPECIAL_METHODS
 
 
 class Promises(NamedTuple):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, PyTree
 
@@ -80,6 +81,13 @@ def linearise_at(system: System, t: Time, state: PyTree) -> System:
     """The system that an implicit step differentiates at a state."""
     linearise = read_traits(system).linearised_at
     return system if linearise is None else linearise(t, state)
+
+
+def push_drift(system: System, state: S, elapsed: ArrayLike, change: ArrayLike) -> S:
+    """How far a state that has drifted for some time [s] drifts on in a change of time [s], to first order."""
+    times = tuple(jnp.asarray(time, leaf_dtype(state)) for time in (elapsed, change))
+    at, further = jnp.broadcast_arrays(*times)
+    return jax.jvp(lambda h: system.drift(state, h), (at,), (further,))[1]
 
 
 @runtime_checkable

@@ -44,7 +44,7 @@ class ScaledMotion(NamedTuple):
 class TimeScaled(eqx.Module):
     """A method whose steps follow the pace of the motion, made by `time_scaled`. It remembers its way from dt to dt.
 
-    Called as a plain method it forgets it, and begins anew at each dt.
+    Called as a plain method it forgets it, and starts over at each dt.
     """
 
     method: Function
@@ -56,16 +56,12 @@ class TimeScaled(eqx.Module):
         pace = "" if self.pace is None else f", {callable_name(self.pace)}"
         return f"time_scaled({callable_name(self.method)}{pace})"
 
-    def check_scene(self, scene: Any) -> Any:
-        """The scene as it is; ValueError or TypeError for one without the energy that its pace is to follow."""
-        if self.pace is None:
-            _demand_conserved_energy(scene)
-        return scene
-
     def start(self, system: System, t: Time, state: Any, dt: ArrayLike) -> ScaledMotion:
         """The memory at the start of a run, before the first step dt [s] from the time t [s]."""
         nowhere = jnp.zeros(read_traits(system).status_shape, leaf_dtype(state))
-        return ScaledMotion(state, nowhere, self._rule.begin(self.check_scene(system), t, state))
+        if self.pace is None:
+            _demand_conserved_energy(system)
+        return ScaledMotion(state, nowhere, self._rule.begin(system, t, state))
 
     def advance(
         self, system: System, t: Time, state: Any, dt: ArrayLike, memory: ScaledMotion
@@ -214,7 +210,7 @@ def time_scaled(method: Callable, pace: Callable | None = None) -> TimeScaled:
 
     No step of it ends with dt: frames are a step back from the way it goes, which costs a step more for each dt (without a
     pace two). `simulate` carries its way from dt to dt; called by hand, or where contacts end steps
-    early, it begins anew at each dt, and does not keep the energy as well. Reverse mode knows the derivatives of 4096 steps
+    early, it starts over at each dt, and does not keep the energy as well. Reverse mode knows the derivatives of 4096 steps
     in one dt. Raises ValueError or TypeError for other methods and, while tracing, for forces without a potential.
 
     Example:

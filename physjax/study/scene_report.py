@@ -11,7 +11,7 @@ from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import Scene, project
 from physjax.show import auto_plot
 from physjax.show.style import AS_GIVEN
-from physjax.stepping.methods import METHODS, SPECIAL_METHODS, find_method
+from physjax.stepping.methods import METHODS, find_method, list_all_methods
 from physjax.stepping.simulate import simulate
 from physjax.study import accuracy, energy, stability
 from physjax.study.accuracy.recommendation import Recommendation
@@ -53,8 +53,7 @@ class SceneStudy(NamedTuple):
 
         Only of methods that are stable on an undamped oscillator as well: the ablation leaves the damping out.
         """
-        known = METHODS | SPECIAL_METHODS
-        stable = {name for name, method in known.items() if method.promises.stability_limit > 0}
+        stable = {name for name, method in list_all_methods().items() if method.promises.stability_limit > 0}
         ours = [
             run
             for run in self.precision.runs

@@ -146,7 +146,7 @@ class _CountingSystem(NamedTuple):
 
 def count_evaluations_per_try(method: Adaptive, scene: Scene) -> int:
     """Force evaluations of each step that an adaptive method tries, accepted or not."""
-    pair = method.find_pair(scene) if scene.only_moves else Doubling(method.method, method.order)
+    pair = method.find_pair(scene)
     if isinstance(pair, Doubling):
         return 3 * count_evaluations(subdivided_method(method), scene)
     promises = read_promises(subdivided_method(method))

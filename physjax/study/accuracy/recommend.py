@@ -57,7 +57,7 @@ FLOAT32_FINENESS_FACTORS = (1.0, 1.25)
 MIN_NUMBERS_FOR_FLOAT32 = 64
 """Numbers in a state below which a step takes as long in either precision: a vector register or a few."""
 ROUGH_ERROR, ROUGH_ORDER = 1e-5, 6
-"""Where no smaller error is asked for, methods of higher order cannot win: their steps are longer than the motion is smooth."""
+"""Where no smaller error is asked for, methods of higher order cannot win: motion is not smooth over steps as long as theirs."""
 LARGEST_COMPARED_LIMIT = 1e6
 """Stands for an infinite stability limit where methods are compared, so that two that are always stable are equals."""
 
@@ -79,13 +79,12 @@ def recommend(
     Errors are relative to the extent of the true path (`norm`: see `accuracy.path` and its neighbours; or your own
     function (times, states)), or in units of `scale`, at `frames` equally spaced moments. The truth is diffrax's Dopri8;
     with contacts, forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson:
-    the answer says which. `methods`: the registry, with equal steps and, where
-    they know their errors, with steps of their own, unless given; those that promise no more than another
-    in any respect are left out, adaptive ones also where contacts are resolved at the end of a step, implicit ones where
-    accuracy limits the step before stability does. `seconds` of processor time (of
-    wall-clock time where the work is not on a CPU) bound the search: what is not reached is reported. Everything rarer is
-    a field of `accuracy.SearchOptions`, accepted as a keyword as well: `gradient`, `scale`, `dtypes`, `frames`,
-    `progress`.
+    the answer says which. `methods`: those of the registry that suit the scene, with equal steps and, where they know their
+    errors, with steps of their own, unless given; those that promise no more than another in any respect are left out,
+    adaptive ones also where there are contacts, implicit ones where accuracy limits the step before stability does.
+    `seconds` of processor time (of wall-clock time where the work is not on a CPU) bound the search: what is not reached
+    is reported. Everything rarer is a field of `accuracy.SearchOptions`, accepted as a keyword as well: `gradient`,
+    `scale`, `dtypes`, `frames`, `progress`.
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
 
     Example:

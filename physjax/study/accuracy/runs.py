@@ -249,9 +249,10 @@ def _count_effort(entry: CompiledRun, fineness: float) -> Effort:
         each = count_evaluations(method, entry.scene)
         return {"dt": entry.dt(fineness), "tolerance": None, "steps": steps, "evaluations": each * steps}
     measured = count_steps(entry.scene, method, dt=entry.dt(fineness), steps=frames)
-    # lanes run in step: the slowest lane of each dt sets the count
-    tries = np.asarray(measured.accepted + measured.rejected).reshape(frames, -1).max(axis=1).sum()
-    # and two for the length of the first step: of the run, or of each dt where steps begin anew with it
+    each = np.asarray(measured.accepted + measured.rejected).reshape(frames, -1)
+    # the slowest lane sets the count: of the run, or of each dt where contacts make lanes run in step
+    tries = each.sum(axis=0).max() if entry.scene.only_moves else each.max(axis=1).sum()
+    # and two for the length of the first step: of the run, or of each dt where steps start over with it
     evaluations = int(
         count_evaluations_per_try(method, entry.scene) * tries + 2 * (1 if entry.scene.only_moves else frames)
     )

@@ -216,13 +216,12 @@ def time_finalists(finalists: Sequence[tuple[CompiledRun, Trial]]) -> list[float
 
 
 def estimate_richardson_error(task: SearchTask, entry: CompiledRun, trial: Trial) -> float:
-    """Richardson's estimate of a run's error: how much half the step (a tenth of the tolerance) changes it."""
-    order = entry.promised if np.isfinite(entry.promised) else 1.0
-    # such that the finer run has 1/2^order of the error, or less
-    factor = TOLERANCE_FACTOR ** (1 + 1 / order) if entry.adaptive else STEPS_FACTOR
+    """Richardson's estimate of a run's error: how much half the step (a tolerance for a tenth of the error) changes it."""
+    # a tenth of the error, or that of half the step
+    factor = TOLERANCE_FACTOR ** (1 / entry.error_power) if entry.adaptive else STEPS_FACTOR
     here, finer = (jax.tree.map(np.asarray, entry(f)) for f in (trial.fineness, trial.fineness * factor))
     here, finer = ((found if task.push is None else found[0]) for found in (here, finer))
     size = task.truth.size(task.norm, task.scale)
     change = task.norm.error(task.truth.scene, task.truth.times, here, finer, size)
-    # of the error e the finer run still has e/2^p: what changed is the rest
-    return change / (1 - 2.0**-order)
+    # of the error the finer run still has a share: what changed is the rest
+    return change / (1 - factor**-entry.error_power)

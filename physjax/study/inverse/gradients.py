@@ -77,7 +77,7 @@ def health(
     error: ArrayLike | None = None,
     size: ArrayLike | None = None,
     fraction: ArrayLike = 0.1,
-    reverse: bool = True,
+    reverse: bool | None = None,
 ) -> GradientHealth:
     """How the sensitivity of a run to its start grows with its length, and until when its gradient can be trusted.
 
@@ -116,7 +116,7 @@ def health(
     law = _fit_growth_law(time, sensitivity)
     horizon = _find_horizon(time, sensitivity, limit, *law)
     mismatch, ok = None, jnp.ones(horizon.shape, bool)
-    if reverse:
+    if reverse is not False:
         pull = jax.vjp(lambda leaf: positions(leaf)[0], start)[1]
         mismatch, ok, whole = _check_reverse_mode(scene, spread, pull, limit)
         horizon = jnp.where(ok | ~whole, horizon, 0.0)
