@@ -92,15 +92,18 @@ class SplitFunction(NamedTuple):
         return self.call(*trees)
 
 
-def compute_by_components(function: Callable[..., PyTree], *examples: PyTree, like: PyTree) -> SplitFunction:
+def compute_by_components(function: Callable[..., PyTree], *examples: PyTree, like: PyTree = None) -> SplitFunction:
     """A function of trees of arrays as one of trees whose vectors are split, as in the examples; its result is split `like` that.
+
+    Without `like`, the arrays of the result are whole.
 
     The function is traced once, here, with whole arrays; what it closes over is a constant.
     """
     described = jax.tree.map(describe_whole, examples, is_leaf=is_stored)
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*described)
     structure = jax.tree.structure(shape)
-    wanted = [is_stored(leaf) for leaf in jax.tree.leaves(like, is_leaf=is_stored)]
+    asked = shape if like is None else like
+    wanted = [is_stored(leaf) for leaf in jax.tree.leaves(asked, is_leaf=is_stored)]
     interpreter = SplittingInterpreter()
 
     def by_components(*trees: PyTree) -> PyTree:

@@ -14,6 +14,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
+from physjax.backend import splits_vectors
+from physjax.components import compute_by_components, forget_wholes, split_vectors
 from physjax.loops import Time, moment_at
 from physjax.parts import holds_user_code, is_untransformed
 from physjax.scene import Scene
@@ -59,12 +61,20 @@ def _take_in_one_loop(
     """All frames in one loop, of blocks of lanes one after the other where there are many."""
     arrays, still = eqx.partition(scene, scene.changing())
 
-    def run(arrays: PyTree, still: PyTree, dt: Array) -> PyTree:
+    def run_whole(arrays: PyTree, still: PyTree, dt: Array) -> PyTree:
         part = eqx.combine(arrays, still)
         clock = lambda n: moment_at(first_step + n * save_every, dt, part.state.dtype)  # noqa: E731
         span = dt * save_every.astype(dt.dtype)
         memory = method.start(part, clock(jnp.zeros((), jnp.int32)), part.state, span)
         return method.sample(part, clock, span, frames, memory)[0]
+
+    def run(arrays: PyTree, still: PyTree, dt: Array) -> PyTree:
+        if not splits_vectors():
+            return run_whole(arrays, still, dt)
+        vectors = scene.build_vector_mask((arrays, still))
+        moving, constant = (split_vectors(*pair) for pair in zip((arrays, still), vectors, strict=True))
+        moving = forget_wholes(moving)
+        return compute_by_components(run_whole, moving, constant, dt)(moving, constant, dt)
 
     # steps of its own are more than those of a block must be for it to pay
     blocks = Blocks.of(scene, arrays, frames * 8)

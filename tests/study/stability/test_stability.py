@@ -10,7 +10,8 @@ from physjax.stepping.methods import METHODS
 
 ALL = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 BOUNDED = {name: method for name, method in METHODS.items() if np.isfinite(method.promises.stability_limit)}
-SLOW_TO_GROW = {"euler", "midpoint"}
+SLOW_TO_GROW = {"euler", "midpoint", "dopri8"}
+"""Just above their limit, by a thousandth a step or less."""
 
 
 def oscillator(k=15.0, b=None, m=1.0):
@@ -97,13 +98,13 @@ def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
         if not damped and not method.promises.stability_limit:
             assert not stability.limit(scene, method).each.any()
             continue
-        steps = 4000 if name not in SLOW_TO_GROW else 8000 if count == 8 else 20_000
+        steps = 4000 if name not in SLOW_TO_GROW else 12_000
         predicted, below, above = confirmed(scene, method, steps)
         assert below.all(), name
         # what grows by less than this all through the run is not seen in it
         seen = steps / 2 * np.log(stability.growth(scene, method, 1.02 * predicted.each)) > np.log(1000)
         assert above[seen].all(), name
-        assert seen.mean() > 0.9 or name in SLOW_TO_GROW
+        assert seen.mean() > 0.9 or name in {"euler", "midpoint"}
 
 
 @pytest.mark.slow
