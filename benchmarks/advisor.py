@@ -36,8 +36,8 @@ from physjax.scenes import SCENES
 from physjax.stepping.reference import cast_floats, discontinuities, ode_term
 from physjax.study.accuracy import error_measures, list_compared_methods, recommend
 from physjax.study.accuracy.compiled_run import compile_run, stack_copies
+from physjax.study.accuracy.exploring import list_candidates
 from physjax.study.accuracy.method_facts import smallest_size
-from physjax.study.accuracy.recommend import list_candidates
 from physjax.study.accuracy.reference_solution import solve_reference
 from physjax.study.accuracy.search import SearchTask, explore_method, time_finalists
 from physjax.study.problem import Problem

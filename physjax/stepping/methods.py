@@ -119,7 +119,7 @@ def heun(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(HEUN, system, t, state, dt)
 
 
-@promises(order=5, evaluations=6, stability_limit=1.0554808, pair=TableauPair(TSIT5))
+@promises(order=5, evaluations=6, stability_limit=1.0554808, relative_step=1.7, pair=TableauPair(TSIT5))
 def tsit5(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Tsitouras' Runge-Kutta method of order 5, for smooth forces of any kind; equals `diffrax.Tsit5` step for step.
 
@@ -147,7 +147,7 @@ def dopri8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(DOPRI8, system, t, state, dt)
 
 
-@promises(order=4, evaluations=7, stability_limit=3.1634, order_with_drag=1, special=True)
+@promises(order=4, evaluations=7, stability_limit=3.1634, order_with_drag=1, relative_step=5.0, special=True)
 def blanes_moan4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Blanes and Moan's symplectic splitting of order 4: energy bounded.
 

@@ -36,17 +36,19 @@ class Promises(NamedTuple):
 
     `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stability_limit`: the largest
     stable ω·dt on the undamped oscillator, whose growth stays below 2e-4 a step; 0 where it grows at any step.
-    `order_with_drag`: the order once forces depend on velocity, where it differs.
+    `order_with_drag`: the order once forces depend on velocity, where it differs. `relative_step`: how many times as long
+    its steps are at equal errors as those of others of its order, for one that is made for long steps.
 
     Example:
         >>> methods.verlet.promises
-        Promises(order=2, evaluations=2, stability_limit=2.0, order_with_drag=2)
+        Promises(order=2, evaluations=2, stability_limit=2.0, order_with_drag=2, relative_step=1.0)
     """
 
     order: int
     evaluations: int
     stability_limit: float
     order_with_drag: int
+    relative_step: float = 1.0
 
 
 def promises(
@@ -55,6 +57,7 @@ def promises(
     evaluations: int,
     stability_limit: float,
     order_with_drag: int | None = None,
+    relative_step: float = 1.0,
     pair: Pair | None = None,
     special: bool = False,
 ) -> Callable[[Callable], Callable]:
@@ -70,7 +73,7 @@ def promises(
 
     def attach(method: Callable) -> Callable:
         with_drag = order if order_with_drag is None else order_with_drag
-        promised = Promises(order, evaluations, stability_limit, with_drag)
+        promised = Promises(order, evaluations, stability_limit, with_drag, relative_step)
         method.promises = promised  # pyright: ignore[reportFunctionMemberAccess]  # a function may carry attributes
         if pair is not None:
             method.pair = pair  # pyright: ignore[reportFunctionMemberAccess]

@@ -47,7 +47,7 @@ def subdivided_method(method: Adaptive) -> Callable:
 
 def smallest_size(scene: Scene) -> float:
     """Typical size of the smaller of position and velocity: the unit of an absolute tolerance."""
-    leaves = jax.tree.leaves((scene.state, _generalised_force(scene, scene.state)))
+    leaves = jax.tree.leaves((scene.state, _measure_force(scene)))
     sizes = [np.sqrt(np.mean(np.square(np.asarray(leaf, float)))) for leaf in leaves]
     return float(min(size for size in sizes if size > 0)) if any(sizes) else 1.0
 
@@ -58,7 +58,7 @@ def smallest_sizes(scene: Scene) -> np.ndarray:
     Shaped to broadcast with a leaf of the state.
     """
     axes, ratios = (-2, -1) if scene.couples else (-1,), []
-    for leaf in map(np.asarray, jax.tree.leaves((scene.state, _generalised_force(scene, scene.state)))):
+    for leaf in map(np.asarray, jax.tree.leaves((scene.state, _measure_force(scene)))):
         whole = np.sqrt(np.mean(np.square(leaf)))
         if whole > 0:
             ratios.append(np.sqrt(np.mean(np.square(leaf), axis=axes, keepdims=True)) / whole)
@@ -72,15 +72,23 @@ def depends_on_velocity(scene: Scene) -> bool:
     with jax.enable_x64(True):
         scene = cast_floats(scene, jnp.float64)
         rng = np.random.default_rng(0)
-        push = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)) * (1 + jnp.abs(leaf)), scene.state)
+        push = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape) * (1 + np.abs(np.asarray(leaf))), scene.state)
         # at both signs of a random change of velocity: a force that ignores it is the same to the last bit
-        ends = (_generalised_force(scene, scene.kick(scene.state, push, sign)) for sign in (1.0, -1.0))
-        return any(bool(jnp.any(a != b)) for a, b in zip(*map(jax.tree.leaves, ends), strict=True))
+        ends = (jax.tree.map(np.asarray, _probe_force(scene, push, np.asarray(sign))) for sign in (1.0, -1.0))
+        return any(bool(np.any(a != b)) for a, b in zip(*map(jax.tree.leaves, ends), strict=True))
 
 
-@jax.jit  # one compilation instead of one for each operation
-def _generalised_force(scene: Scene, state: PyTree) -> PyTree:
+@jax.jit  # one compilation, for all probes, instead of one for each operation
+def _probe_force(scene: Scene, push: PyTree, share: ArrayLike) -> PyTree:
+    """The force after a share of a push."""
+    state = scene.kick(scene.state, push, share)
     return state.generalised_force(scene, jnp.zeros((), state.dtype))
+
+
+def _measure_force(scene: Scene) -> PyTree:
+    """The force on the state as it is, by the program that probes it."""
+    still = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), scene.state)
+    return _probe_force(scene, still, np.zeros((), scene.state.dtype))
 
 
 def list_methods(scene: Scene) -> dict[str, Callable]:

@@ -14,16 +14,9 @@ from physjax.backend import read_work_clock
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.scene import Scene
-from physjax.stepping.registry import read_promises
 from physjax.study.accuracy.compiled_run import CompiledRun, compile_run, draw_random_push
 from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure, path
-from physjax.study.accuracy.method_facts import (
-    depends_on_velocity,
-    list_adaptive_methods,
-    list_methods,
-    method_title,
-    promised_order,
-)
+from physjax.study.accuracy.exploring import compile_ahead, explore_methods, list_candidates, rate_candidates
 from physjax.study.accuracy.options import SearchOptions, merge_options
 from physjax.study.accuracy.reasons import (
     SAFE_ERROR_SHARE,
@@ -33,14 +26,13 @@ from physjax.study.accuracy.reasons import (
     is_float32_accurate,
 )
 from physjax.study.accuracy.recommendation import Choice, Recommendation
-from physjax.study.accuracy.reference_solution import solve_reference
+from physjax.study.accuracy.reference_solution import solve_reference, suits_diffrax
 from physjax.study.accuracy.search import (
     MAX_RUN_SECONDS,
     Exploration,
     SearchTask,
     Trial,
     estimate_richardson_error,
-    explore_method,
     refine_step,
     run_trial,
     time_finalists,
@@ -48,18 +40,14 @@ from physjax.study.accuracy.search import (
 from physjax.study.problem import Problem
 from physjax.text import progress_bar
 
-MAX_FINALISTS, FINALIST_TIME_RATIO = 3, 4.0
+MAX_FINALISTS, FINALIST_TIME_RATIO = 3, 2.0
 """Methods that are verified and timed for an error, by what their runs predict, if at most this many times slower than others."""
 REFERENCE_TIME_SHARE = 0.2
 """Share of the search's time that the true path may take, where our own steps are refined for it."""
 FLOAT32_FINENESS_FACTORS = (1.0, 1.25)
 """How much finer than in float64 a run in float32 is tried: its rounding takes a part of the error."""
-MIN_NUMBERS_FOR_FLOAT32 = 64
-"""Numbers in a state below which a step takes as long in either precision: a vector register or a few."""
-ROUGH_ERROR, ROUGH_ORDER = 1e-5, 6
-"""Where no smaller error is asked for, methods of higher order cannot win: motion is not smooth over steps as long as theirs."""
-LARGEST_COMPARED_LIMIT = 1e6
-"""Stands for an infinite stability limit where methods are compared, so that two that are always stable are equals."""
+MIN_NUMBERS_FOR_FLOAT32 = 512
+"""Numbers in a state below which a run takes as long in either precision, to a tenth (measured with drag on 16 to 8192)."""
 
 
 @announce_compiling("recommend")
@@ -102,10 +90,13 @@ def recommend(
     with jax.enable_x64(True), shown as bar:
         bar.set_postfix_str("the true path")
         push = draw_random_push(scene) if options.gradient else None
+        candidates = rate_candidates(scene, list_candidates(scene, min(errors)) if methods is None else methods)
+        # what diffrax takes to compile, another thread uses for the likely winner
+        ahead = compile_ahead(problem, candidates, errors, push) if suits_diffrax(problem) else None
         truth = solve_reference(problem, wanted=min(errors), seconds=REFERENCE_TIME_SHARE * seconds, push=push)
         task = SearchTask(problem, truth, norm, options.scale, push, deadline)
-        tried = list_candidates(scene, min(errors)) if methods is None else list(methods)
-        found, untried = _explore_methods(task, tried, min(errors), bar)
+        goals = _list_goals(task, errors)
+        found, untried = explore_methods(task, candidates, goals, ahead, bar, everything=methods is not None)
         answers = _answer_errors(task, found, errors, dtypes, untried, bar)
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
 
@@ -125,80 +116,11 @@ def _check_request(
     return Problem(scene, float(horizon), frames=as_positive_integer("frames", frames)), [float(e) for e in errors]
 
 
-def list_candidates(scene: Scene, least: float = 0.0) -> list[Callable]:
-    """Methods for a scene in the order in which they are tried: the likely winners first, without those that cannot win.
-
-    `least` is the smallest error that is asked for.
-    """
-    late, velocity_dependent = scene.resolves_at_step_end, depends_on_velocity(scene)
-
-    def rate_merit(method: Callable) -> tuple[float, ...]:
-        promises = method.promises  # every method of the registry has them
-        limit = min(promises.stability_limit, LARGEST_COMPARED_LIMIT)
-        return promised_order(method, velocity_dependent, scene), -promises.evaluations, limit
-
-    possible = [m for m in list_methods(scene).values() if m.promises.order <= ROUGH_ORDER or least < ROUGH_ERROR]
-    chosen: list[Callable] = []
-    # implicit methods do not end by stability and cost more than their promise says: last
-    for method in sorted(possible, key=lambda m: (_is_implicit(m), *(-x for x in rate_merit(m)))):
-        merit = rate_merit(method)
-        if not any(all(a >= b for a, b in zip(rate_merit(other), merit, strict=True)) for other in chosen):
-            chosen.append(method)
-    # adaptive steps cannot see an error that a contact makes at the end of a step
-    adaptives = (
-        [] if late else [m for m in list_adaptive_methods(scene) if m.order <= ROUGH_ORDER or least < ROUGH_ERROR]
-    )
-    explicit = [method for method in chosen if not _is_implicit(method)]
-    stiff = [method for method in chosen if _is_implicit(method)]
-    return [*adaptives[:1], *explicit, *adaptives[1:], *stiff]
-
-
-def _is_implicit(method: Callable) -> bool:
-    promises = read_promises(method)
-    return promises is not None and bool(np.isinf(promises.stability_limit))
-
-
-def _explore_methods(
-    task: SearchTask, methods: Sequence[Callable], least: float, bar: tqdm
-) -> tuple[list[Exploration], tuple[str, ...]]:
-    """The runs of every method, as long as there is time, and the names of those for which there was none."""
-    found: list[Exploration] = []
-    untried, longest = [], 0.0
-    for method in methods:
-        name = method_title(method)
-        bar.set_postfix_str(name)
-        any_unstable = any(np.isfinite(entry.longest_stable_step) for entry in found if entry.trials)
-        if _is_implicit(method) and found and not any_unstable:
-            continue  # no step was too long for the others, so stability costs nothing here
-        # as much again is needed to verify
-        if found and 2 * longest > task.time_left():
-            untried.append(name)
-            continue
-        started = read_work_clock()
-        entry = compile_run(task.problem, method, push=task.push)
-        found.append(explore_method(task, entry, least, found, _guess_fineness(found, entry)))
-        longest = max(longest, read_work_clock() - started)
-        bar.update()
-    return found, tuple(untried)
-
-
-def _guess_fineness(found: Sequence[Exploration], entry: CompiledRun) -> float:
-    """The coarsest number of steps worth a run: with twice the step that was stable for a method with a like limit."""
-
-    def read_limit(method: Callable) -> float:
-        promises = read_promises(method)
-        return 0.0 if promises is None else promises.stability_limit
-
-    mine = read_limit(entry.method)
-    limits = [
-        e.longest_stable_step * mine / read_limit(e.compiled_run.method)
-        for e in found
-        if np.isfinite(e.longest_stable_step) and read_limit(e.compiled_run.method)
-    ]
-    if not limits or not 0 < mine < np.inf:
-        return 1.0
-    spacing = entry.problem.duration / entry.problem.frames
-    return max(1.0, float(2.0 ** np.floor(np.log2(spacing / min(limits) / 2))))
+def _list_goals(task: SearchTask, errors: Sequence[float]) -> list[float]:
+    """The errors that a run in float64 may have, for each of those asked for that can be promised at all."""
+    truth_error = float(task.truth.truth_error(task.norm, task.scale).max())
+    share = SAFE_ERROR_SHARE["float64"]
+    return [share * wanted - truth_error for wanted in errors if truth_error < TRUTH_ERROR_SHARE * wanted]
 
 
 def _answer_errors(
@@ -232,18 +154,19 @@ def _verify_finalists(
     """The runs that keep an error, at most one of each method and float type, of those that may be the fastest."""
     goals = {dtype: SAFE_ERROR_SHARE[dtype] * wanted - truth_error for dtype in SAFE_ERROR_SHARE}
     ranked = sorted(range(len(found)), key=lambda i: found[i].seconds(found[i].fineness(goals["float64"])))
-    kept, most = [], np.inf
+    wide, most = [], np.inf
     for i in ranked[:MAX_FINALISTS]:
         found[i], trial = refine_step(task, found[i], goals["float64"], min(most, 4 * MAX_RUN_SECONDS))
-        if trial is None:
-            continue
-        most = min(most, FINALIST_TIME_RATIO * trial.seconds)
-        if "float64" in dtypes:
-            kept.append((found[i].compiled_run, trial))
-        # of a few numbers float32 saves nothing that compiling another program would not cost
-        worth = "float64" not in dtypes or _count_numbers(task.problem.scene) >= MIN_NUMBERS_FOR_FLOAT32
-        if "float32" in dtypes and worth and is_float32_accurate(task, wanted):
-            kept += _try_float32(task, found[i], trial, goals["float32"], compiled)
+        if trial is not None:
+            most = min(most, FINALIST_TIME_RATIO * trial.seconds)
+            wide.append((found[i], trial))
+    kept = [(entry.compiled_run, trial) for entry, trial in wide] if "float64" in dtypes else []
+    # of a few numbers float32 saves nothing that compiling another program would not cost
+    worth = "float64" not in dtypes or _count_numbers(task.problem.scene) >= MIN_NUMBERS_FOR_FLOAT32
+    if "float32" in dtypes and worth and is_float32_accurate(task, wanted):
+        fast = sorted(wide, key=lambda pair: pair[1].seconds)
+        for entry, trial in fast[:1] if "float64" in dtypes else fast:
+            kept += _try_float32(task, entry, trial, goals["float32"], compiled)
     return kept
 
 

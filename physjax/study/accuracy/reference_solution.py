@@ -29,6 +29,8 @@ EXTENT_TOLERANCE = 1e-6
 """Tolerance of the quick solution that shows how far a path goes."""
 TIGHT_TOLERANCE, LOOSE_TOLERANCE = 1e-13, 4e-13
 """Tolerances of the two references through diffrax: their steps differ by a tenth, and so do their errors."""
+DIFFRAX_ORDER = 8
+"""The order of Dopri8."""
 MAX_DIFFRAX_NUMBERS = 20_000
 """Numbers in a state beyond which diffrax takes too long at such tolerances: a thousand ropes take a quarter of an hour."""
 FIRST_STEPS_PER_FRAME = 8
@@ -54,7 +56,8 @@ class ReferenceSolution(NamedTuple):
 
     `second` and `nudged` are None where the states are a closed form. `slopes` is the derivative along a push of the start.
     `reach` is how far each unit goes, at the moments and in between. `less_nudged()` solves from a start that was nudged
-    by a tenth of that.
+    by a tenth of that, `solve_start(scene)` from any. `compiled_run` is what it was solved by, where that is a method of
+    our own; `steps` between two moments are those of diffrax otherwise.
     """
 
     scene: Scene
@@ -66,6 +69,17 @@ class ReferenceSolution(NamedTuple):
     source: str
     reach: np.ndarray | None = None
     less_nudged: Callable[[], PyTree] | None = None
+    solve_start: Callable[[Scene], PyTree] | None = None
+    compiled_run: CompiledRun | None = None
+    steps: float | None = None
+
+    @property
+    def difficulty(self) -> float | None:
+        """The steps between two moments at which errors would be as large as the path; None where that is not known.
+
+        Those that an error of the tolerance takes, brought to an error of 1 by the order of the solver.
+        """
+        return None if self.steps is None else self.steps * TIGHT_TOLERANCE ** (1 / DIFFRAX_ORDER)
 
     def truth_error(self, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> np.ndarray:
         """How far the truth itself may be wrong at each moment, `(moments,)`; 0 for a closed form."""
@@ -152,35 +166,74 @@ def solve_reference(
             "closed form",
             _measure_reach(scene, problem.times, states, between),
         )
-    few = sum(leaf.size for leaf in jax.tree.leaves(scene.state)) <= MAX_DIFFRAX_NUMBERS
-    if problem.is_ode and own is None and few:
+    if own is None and suits_diffrax(problem):
         # equal steps get through where an adaptive solver gives up, such as a force that switches about zero
-        found = _build_reference(problem, scene, *_make_diffrax_solver(problem, push), strict=True)
+        found = _build_reference(problem, scene, _make_diffrax_solver(problem, push), strict=True)
         if found is not None:
             return found
-    found = _build_reference(problem, scene, *_make_own_solver(problem, own or rk4, wanted, seconds, push))
+    found = _build_reference(problem, scene, _make_own_solver(problem, own or rk4, wanted, seconds, push))
     assert found is not None  # only a strict one may be
     return found
 
 
-def _build_reference(
-    problem: Problem, scene: Scene, solve: Callable, sample_between: Callable, strict: bool = False
-) -> ReferenceSolution | None:
+def suits_diffrax(problem: Problem) -> bool:
+    """Whether diffrax can solve a problem, in a time that one may wait."""
+    few = sum(leaf.size for leaf in jax.tree.leaves(problem.scene.state)) <= MAX_DIFFRAX_NUMBERS
+    return problem.is_ode and few
+
+
+class _Solution(NamedTuple):
+    """What a solver finds for the scene itself; `steps` between two moments, where it counts them."""
+
+    states: PyTree
+    second: PyTree
+    slopes: PyTree
+    source: str
+    steps: float | None = None
+
+
+class _Solver(NamedTuple):
+    """A way to solve a problem, compiled once: the scene itself with a second, coarser solution; other starts; in between.
+
+    `solve_start(scene)` is as good as the first solution, `sample_between(scene)` a quick look at other moments.
+    """
+
+    solve: Callable[[Scene], _Solution]
+    solve_start: Callable[[Scene], PyTree]
+    sample_between: Callable[[Scene], PyTree]
+    compiled_run: CompiledRun | None = None
+
+
+def _build_reference(problem: Problem, scene: Scene, solver: _Solver, strict: bool = False) -> ReferenceSolution | None:
     """The reference that a solver gives for a problem; where it is `strict`, None if any of that is not finite."""
     finite = lambda tree: not strict or all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))  # noqa: E731
-    states, second, slopes, source = solve(scene)
-    if not finite((states, second)):
+    found = solver.solve(scene)
+    states = found.states
+    if not finite((states, found.second)):
         return None
-    between = sample_between(scene)
+    between = solver.sample_between(scene)
     if not finite(between):
         return None
     visited = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, between)
-    solve_nudged = lambda share: solve(nudge_start(scene, visited, share), alone=True)[0]  # noqa: E731
+    solve_nudged = lambda share: solver.solve_start(nudge_start(scene, visited, share))  # noqa: E731
     reach = _measure_reach(scene, problem.times, states, between)
     less, moved = partial(solve_nudged, NUDGE_SHARE / NUDGE_RATIO), solve_nudged(NUDGE_SHARE)
     if not finite(moved):
         return None
-    return ReferenceSolution(scene, problem.times, states, second, moved, slopes, source, reach, less)
+    return ReferenceSolution(
+        scene,
+        problem.times,
+        states,
+        found.second,
+        moved,
+        found.slopes,
+        found.source,
+        reach,
+        less,
+        solver.solve_start,
+        solver.compiled_run,
+        found.steps,
+    )
 
 
 def _measure_reach(scene: Scene, times: np.ndarray, *paths: PyTree) -> np.ndarray:
@@ -206,43 +259,49 @@ def nudge_start(scene: Scene, states: PyTree, share: float = NUDGE_SHARE) -> Sce
     return scene.replace(state=state if scene.held is None else state.hold_lanes(1 - scene.held.astype(state.dtype)))
 
 
-def _make_diffrax_solver(problem: Problem, push: PyTree) -> tuple[Callable, Callable]:
+def _make_diffrax_solver(problem: Problem, push: PyTree) -> _Solver:
     """Dopri8 at two tolerances, and a quick solution in between the moments; compiles once."""
     times, end = jnp.asarray(problem.times), jnp.asarray(problem.duration)
     # sizes of the scene as given: those of a nudged one that starts at rest are tiny
-    size, solver = jnp.asarray(smallest_sizes(cast_floats(problem.scene, jnp.float64))), build_default_solver()
+    size, solver = np.asarray(smallest_sizes(cast_floats(problem.scene, jnp.float64))), build_default_solver()
 
-    def solve_at(scene: Scene, tolerance: float, times: Array = times) -> tuple[PyTree, PyTree]:
+    def solve_at(scene: Scene, tolerance: float, times: Array = times) -> tuple[PyTree, PyTree, int]:
         rtol, atol = jnp.asarray(tolerance), jnp.asarray(tolerance * size)
-        run = lambda state: solve_ode(scene.replace(state=state), times, end, rtol, atol, solver, True)[0]  # noqa: E731
-        return (run(scene.state), None) if push is None else jax.jvp(run, (scene.state,), (push,))
 
-    def solve(scene: Scene, alone: bool = False) -> tuple[PyTree, PyTree, PyTree, str]:
-        states, slopes = jax.tree.map(np.asarray, solve_at(scene, TIGHT_TOLERANCE))
-        good = not alone and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(states))
-        second = jax.tree.map(np.asarray, solve_at(scene, LOOSE_TOLERANCE))[0] if good else None
-        return states, second, slopes, f"diffrax Dopri8, tolerance {TIGHT_TOLERANCE:.0e}"
+        def run(state: PyTree) -> tuple[PyTree, Array]:
+            states, _, counted = solve_ode(scene.replace(state=state), times, end, rtol, atol, solver, True)
+            return states, counted["num_steps"]
 
-    return solve, lambda scene: jax.tree.map(
-        np.asarray, solve_at(scene, EXTENT_TOLERANCE, INTERMEDIATE_TIME_RATIO * times)[0]
+        if push is None:
+            states, steps = run(scene.state)
+            return *jax.tree.map(np.asarray, (states, None)), int(steps)
+        states, slopes, steps = jax.jvp(run, (scene.state,), (push,), has_aux=True)
+        return *jax.tree.map(np.asarray, (states, slopes)), int(steps)
+
+    def solve(scene: Scene) -> _Solution:
+        states, slopes, steps = solve_at(scene, TIGHT_TOLERANCE)
+        good = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(states))
+        second = solve_at(scene, LOOSE_TOLERANCE)[0] if good else None
+        source = f"diffrax Dopri8, tolerance {TIGHT_TOLERANCE:.0e}"
+        return _Solution(states, second, slopes, source, steps / problem.frames)
+
+    return _Solver(
+        solve,
+        lambda scene: solve_at(scene, TIGHT_TOLERANCE)[0],
+        lambda scene: solve_at(scene, EXTENT_TOLERANCE, INTERMEDIATE_TIME_RATIO * times)[0],
     )
 
 
-def _make_own_solver(
-    problem: Problem, method: Callable, wanted: float, seconds: float, push: PyTree
-) -> tuple[Callable, Callable]:
+def _make_own_solver(problem: Problem, method: Callable, wanted: float, seconds: float, push: PyTree) -> _Solver:
     """Our own method with twice the steps again and again, until it no longer changes by what matters, or time is up.
 
     And a quick solution in between the moments, half as fine.
     """
     compiled = compile_run(problem, method, push=push)
-    fineness: list[int] = []  # of the first solution; the nudged one takes the same steps, so their errors cancel
+    fineness: list[int] = []  # of the first solution; other starts take the same steps, so their errors cancel
 
-    def solve(scene: Scene, alone: bool = False) -> tuple[PyTree, PyTree, PyTree, str]:
+    def solve(scene: Scene) -> _Solution:
         runs, count, started = [], FIRST_STEPS_PER_FRAME, read_work_clock()
-        if alone:
-            runs.append(_run_compiled(compiled, scene, fineness[0]))
-            return runs[0][0], None, None, ""
         while True:
             runs.append(_run_compiled(compiled, scene, count))
             if len(runs) >= 3 and _has_converged(problem, scene, runs, CONVERGED_ERROR_SHARE * wanted):
@@ -254,10 +313,16 @@ def _make_own_solver(
         fineness.append(count)
         step = format_seconds(compiled.dt(count))
         states, slopes = runs[-1]
-        return states, _pick_worse(problem, scene, runs), slopes, f"own {compiled.name}, step {step}, by Richardson"
+        source = f"own {compiled.name}, step {step}, by Richardson"
+        return _Solution(states, _pick_worse(problem, scene, runs), slopes, source)
 
     closer = compiled._replace(problem=problem._replace(duration=INTERMEDIATE_TIME_RATIO * problem.duration))
-    return solve, lambda scene: _run_compiled(closer, scene, max(1, fineness[0] // 2))[0]
+    return _Solver(
+        solve,
+        lambda scene: _run_compiled(compiled, scene, fineness[0])[0],
+        lambda scene: _run_compiled(closer, scene, max(1, fineness[0] // 2))[0],
+        compiled,
+    )
 
 
 def _run_compiled(compiled: CompiledRun, scene: Scene, count: int) -> tuple[PyTree, PyTree]:

@@ -26,8 +26,8 @@ MAX_FINENESS = 1e12
 """Of tolerances; below is rounding."""
 CLOSE_STEP_RATIO = 1.15
 """A step within this factor of the longest that would do is as good."""
-TURN_SECONDS, MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS, MIN_TIMING_SECONDS = 1e-3, 7, 1000, 0.3
-"""Finalists take turns of this length [s], for at least this many rounds and seconds: disturbances come in bursts."""
+TURN_SECONDS, MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS, MIN_TIMING_SECONDS = 1e-3, 7, 1000, 0.1
+"""Finalists take turns of this length [s], for at least this many rounds and seconds each: disturbances come in bursts."""
 GRACE_SECONDS = 5.0
 """Beyond the deadline nothing is compiled; short runs may still decide between finalists for this long [s]."""
 ROUNDING_ERROR, COARSE_ERROR = 1e-13, 0.3
@@ -209,7 +209,7 @@ def time_finalists(finalists: Sequence[tuple[CompiledRun, Trial]]) -> list[float
     timings = time_in_turn(
         [partial(entry, trial.fineness) for entry, trial in finalists],
         slice_seconds=TURN_SECONDS,
-        seconds=MIN_TIMING_SECONDS,
+        seconds=MIN_TIMING_SECONDS * len(finalists),
         rounds=(MIN_TIMING_ROUNDS, MAX_TIMING_ROUNDS),
     )
     return [min(trial.seconds, timing.least) for (_, trial), timing in zip(finalists, timings, strict=True)]
