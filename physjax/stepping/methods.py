@@ -147,7 +147,9 @@ def dopri8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_step(DOPRI8, system, t, state, dt)
 
 
-@promises(order=4, evaluations=7, stability_limit=3.1634, order_with_drag=1, relative_step=5.0, special=True)
+@promises(
+    order=4, evaluations=7, stability_limit=3.1634, order_with_drag=1, relative_step=5.0, looped=True, special=True
+)
 def blanes_moan4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Blanes and Moan's symplectic splitting of order 4: energy bounded.
 
@@ -163,7 +165,7 @@ def blanes_moan4(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_split_step(BLANES_MOAN_4, system, t, state, dt)
 
 
-@promises(order=8, evaluations=17, stability_limit=3.0964, order_with_drag=1, special=True)
+@promises(order=8, evaluations=17, stability_limit=3.0964, order_with_drag=1, looped=True, special=True)
 def kahan_li8(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     """Kahan and Li's composition of 17 leapfrogs: symplectic, order 8, energy bounded.
 

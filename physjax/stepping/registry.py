@@ -37,11 +37,12 @@ class Promises(NamedTuple):
     `order`: the global error falls as dt^order. `evaluations`: force evaluations a step. `stability_limit`: the largest
     stable ω·dt on the undamped oscillator, whose growth stays below 2e-4 a step; 0 where it grows at any step.
     `order_with_drag`: the order once forces depend on velocity, where it differs. `relative_step`: how many times as long
-    its steps are at equal errors as those of others of its order, for one that is made for long steps.
+    its steps are at equal errors as those of others of its order, for one that is made for long steps. `looped`: whether
+    its stages are a loop, so that the program of a step holds one evaluation.
 
     Example:
         >>> methods.verlet.promises
-        Promises(order=2, evaluations=2, stability_limit=2.0, order_with_drag=2, relative_step=1.0)
+        Promises(order=2, evaluations=2, stability_limit=2.0, order_with_drag=2, relative_step=1.0, looped=False)
     """
 
     order: int
@@ -49,6 +50,7 @@ class Promises(NamedTuple):
     stability_limit: float
     order_with_drag: int
     relative_step: float = 1.0
+    looped: bool = False
 
 
 def promises(
@@ -58,6 +60,7 @@ def promises(
     stability_limit: float,
     order_with_drag: int | None = None,
     relative_step: float = 1.0,
+    looped: bool = False,
     pair: Pair | None = None,
     special: bool = False,
 ) -> Callable[[Callable], Callable]:
@@ -73,7 +76,7 @@ def promises(
 
     def attach(method: Callable) -> Callable:
         with_drag = order if order_with_drag is None else order_with_drag
-        promised = Promises(order, evaluations, stability_limit, with_drag, relative_step)
+        promised = Promises(order, evaluations, stability_limit, with_drag, relative_step, looped)
         method.promises = promised  # pyright: ignore[reportFunctionMemberAccess]  # a function may carry attributes
         if pair is not None:
             method.pair = pair  # pyright: ignore[reportFunctionMemberAccess]

@@ -28,7 +28,7 @@ from physjax.study.accuracy.method_facts import (
 from physjax.study.accuracy.search import Exploration, SearchTask, explore_method
 from physjax.study.problem import Problem
 
-WORTHWHILE_GAIN = 1.3
+WORTHWHILE_GAIN = 1.25
 """How many times as fast as the best so far a method must look to be compiled and run."""
 ROUGH_ERROR, ROUGH_ORDER = 1e-5, 6
 """Where no smaller error is asked for, methods of higher order cannot win: motion is not smooth over steps as long as theirs."""

@@ -20,10 +20,10 @@ from physjax.study.accuracy.search import COARSE_ERROR, ROUNDING_ERROR, Explorat
 
 USUAL_DIFFICULTY = 0.1
 """θ, in steps between two moments, where nothing has been run: typical of motion that 32 moments show well."""
-FRAME_EVALUATIONS = 20.0
-"""What keeping a frame costs, in evaluations of a force on a few numbers (6 µs to 0.3 µs)."""
-ENTRY_EVALUATIONS = 1.7
-"""What entering the loop between two moments adds for each evaluation that a step holds."""
+FRAME_EVALUATIONS = 16.0
+"""What keeping a frame costs, in evaluations of a force on a few numbers (5 µs to 0.3 µs)."""
+ENTRY_EVALUATIONS = 3.0
+"""What entering the loop between two moments adds for each evaluation that is written out in the program of a step."""
 CONTACT_EVALUATIONS = 10.0
 """What looking for contacts adds to a step, in evaluations."""
 NUMBERS_PER_EVALUATION = 1000.0
@@ -39,7 +39,7 @@ class Costs(NamedTuple):
     """What a run is made of: keeping its frames, entering the loops between them, and in these steps and evaluations.
 
     The time of one such part between each two moments of the run [s]; in evaluations, where nothing has been timed. `entry`
-    is for each evaluation that a step holds.
+    is for each evaluation written out in a step.
     """
 
     frame: float
@@ -108,11 +108,11 @@ def _measure_costs(found: Sequence[Exploration], usual: Costs) -> Costs:
     """What frames, steps and evaluations cost [s], from runs with few and with many steps; else in the usual proportions."""
     slopes, firsts = [], []
     for entry in found:
-        evaluations = weigh_evaluations(entry.compiled_run.method)
-        if evaluations is None:
+        evaluations, written = weigh_evaluations(entry.compiled_run.method)
+        if not evaluations:
             continue
         few, many = entry.trials[0], entry.trials[-1]
-        fixed = usual.frame + usual.entry * evaluations
+        fixed = usual.frame + usual.entry * written
         firsts.append(few.seconds / (fixed + few.fineness * (usual.step + evaluations)))
         slope = (many.seconds - few.seconds) / max(many.fineness - few.fineness, 1e-9)
         if many.fineness >= LEAST_STEPS_RATIO * few.fineness and slope > 0:
@@ -127,20 +127,24 @@ def _measure_costs(found: Sequence[Exploration], usual: Costs) -> Costs:
     return Costs(begun * usual.frame, begun * usual.entry, step, unit)
 
 
-def weigh_evaluations(method: Callable) -> float | None:
-    """What a step costs in evaluations, solves and error control included; None for a method that promises nothing."""
+def weigh_evaluations(method: Callable) -> tuple[float, float]:
+    """What a step costs in evaluations, solves and error control included, and how many are written out in its program.
+
+    Both 0 for a method that promises nothing.
+    """
     promises = read_promises(subdivided_method(method) if isinstance(method, Adaptive) else method)
     if promises is None:
-        return None
+        return 0.0, 0.0
     share = IMPLICIT_COST if np.isinf(promises.stability_limit) else 1.0
-    return promises.evaluations * share * (ADAPTIVE_COST if isinstance(method, Adaptive) else 1.0)
+    cost = promises.evaluations * share * (ADAPTIVE_COST if isinstance(method, Adaptive) else 1.0)
+    return cost, 1.0 if promises.looped else cost
 
 
 def predict_seconds(pace: Pace, method: Callable, order: float, error: float) -> float:
     """The time of a run that keeps an error [s], or in evaluations between two moments where nothing has been timed."""
-    evaluations, costs = weigh_evaluations(method), pace.costs
+    (evaluations, written), costs = weigh_evaluations(method), pace.costs
     promises = read_promises(subdivided_method(method) if isinstance(method, Adaptive) else method)
-    if evaluations is None or promises is None or not order > 0:
+    if promises is None or not order > 0:
         return costs.frame  # nothing is known against it
     frame, difficulty, longest = costs.frame, pace.difficulty(order), promises.stability_limit
     if isinstance(method, Adaptive):
@@ -148,4 +152,4 @@ def predict_seconds(pace: Pace, method: Callable, order: float, error: float) ->
     steps = max(1.0, difficulty * error ** (-1 / order) / promises.relative_step)
     if longest and not isinstance(method, Adaptive):
         steps = max(steps, pace.stiffness / longest)
-    return frame + evaluations * costs.entry + steps * (costs.step + evaluations * costs.evaluation)
+    return frame + written * costs.entry + steps * (costs.step + evaluations * costs.evaluation)

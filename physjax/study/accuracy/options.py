@@ -66,7 +66,8 @@ class SearchOptions(NamedTuple):
 
     With `gradient` the derivative of the path by the start's velocity, in a random direction, must keep the error as well,
     and its time by forward mode counts. Errors are in units of `scale` where it is given. `dtypes`: float types to choose
-    from. Errors are measured at `frames` equally spaced moments. `progress`: show a bar.
+    from. Errors are measured at `frames` equally spaced moments. `starts`: how many starts nearby are run for the bound on
+    the error, whose confidence is starts / (starts + 1); fewer where there is no time. `progress`: show a bar.
 
     Example:
         >>> accuracy.SearchOptions(gradient=True).frames
@@ -77,6 +78,7 @@ class SearchOptions(NamedTuple):
     scale: ArrayLike | None = None
     dtypes: Sequence[DTypeLike] = (np.float64, np.float32)
     frames: int = 32
+    starts: int = 19
     progress: bool = True
 
 

@@ -14,6 +14,7 @@ from physjax.backend import read_work_clock
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.scene import Scene
+from physjax.study.accuracy.bounds import NO_BOUND, Nearby, bound_error, list_nearby
 from physjax.study.accuracy.compiled_run import CompiledRun, compile_run, draw_random_push
 from physjax.study.accuracy.error_measures import ErrorMeasure, as_error_measure, path
 from physjax.study.accuracy.exploring import compile_ahead, explore_methods, list_candidates, rate_candidates
@@ -97,7 +98,8 @@ def recommend(
         task = SearchTask(problem, truth, norm, options.scale, push, deadline)
         goals = _list_goals(task, errors)
         found, untried = explore_methods(task, candidates, goals, ahead, bar, everything=methods is not None)
-        answers = _answer_errors(task, found, errors, dtypes, untried, bar)
+        nearby = list_nearby(task, options.starts, seconds)
+        answers = _answer_errors(task, found, errors, dtypes, untried, nearby, bar)
     return answers[0] if np.ndim(error) == 0 else tuple(answers)
 
 
@@ -129,6 +131,7 @@ def _answer_errors(
     errors: Sequence[float],
     dtypes: Sequence[str],
     untried: tuple[str, ...],
+    nearby: Nearby,
     bar: tqdm,
 ) -> list[Recommendation]:
     """A recommendation for each error, from the runs of all methods."""
@@ -139,7 +142,7 @@ def _answer_errors(
         kept = []
         if truth_error < TRUTH_ERROR_SHARE * wanted:
             kept = _verify_finalists(task, found, wanted, truth_error, dtypes, compiled)
-        answers.append(_build_recommendation(task, found, kept, wanted, truth_error, untried))
+        answers.append(_build_recommendation(task, found, kept, wanted, truth_error, untried, nearby))
     return answers
 
 
@@ -200,6 +203,7 @@ def _build_recommendation(
     wanted: float,
     truth_error: float,
     untried: tuple[str, ...],
+    nearby: Nearby,
 ) -> Recommendation:
     """The fastest of the runs that keep the error, by times taken in turn, with the reason; or what stops it."""
     problem = task.problem
@@ -220,6 +224,7 @@ def _build_recommendation(
         truth_error=truth_error,
         richardson=estimate_richardson_error(task, *kept[ranked[0]]) if kept else float("nan"),
         untried=untried,
+        bound=bound_error(task, nearby, *kept[ranked[0]], truth_error) if kept else NO_BOUND,
     )
 
 

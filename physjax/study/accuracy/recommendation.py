@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from physjax.scene import Scene
 from physjax.stepping.reference import cast_floats
 from physjax.stepping.simulate import simulate
+from physjax.study.accuracy.bounds import NO_BOUND, ErrorBound
 from physjax.text import format_seconds, format_table
 from physjax.trajectory import Trajectory
 
@@ -40,7 +41,7 @@ class Recommendation(NamedTuple):
 
     `best` is None, and `reason` says what stops it, where nothing keeps the error. `richardson` is the error of the best
     estimated from a run with half the step, `truth_error` that of the truth; `untried` the methods for which there was no
-    time.
+    time. `bound` is an error that the best stays below from starts nearby, with a confidence.
     """
 
     scene: Scene
@@ -55,6 +56,20 @@ class Recommendation(NamedTuple):
     truth_error: float
     richardson: float
     untried: tuple[str, ...]
+    bound: ErrorBound = NO_BOUND
+
+    @property
+    def error_bound(self) -> float:
+        """An error that the best stays below from a start within a percent of this one, the truth's doubt included.
+
+        With `confidence`; NaN where no start nearby was run.
+        """
+        return self.bound.error
+
+    @property
+    def confidence(self) -> float:
+        """The probability that the error stays below `error_bound`; 0 where no start nearby was run."""
+        return self.bound.confidence
 
     @property
     def ok(self) -> bool:
@@ -98,5 +113,6 @@ class Recommendation(NamedTuple):
         body = (
             [format_table(["method", "float", "step", "error", "run time per s"], rows, align="<<>>>")] if rows else []
         )
+        bounds = [f"Bound: {self.bound}."] if self.bound.starts else []
         rest = [f"Not tried for lack of time: {', '.join(self.untried)}."] if self.untried else []
-        return "\n".join([title, *body, f"{self.reason}", f"Evidence: {self.evidence}.", *rest])
+        return "\n".join([title, *body, f"{self.reason}", f"Evidence: {self.evidence}.", *bounds, *rest])
