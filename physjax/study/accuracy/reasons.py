@@ -11,8 +11,6 @@ SAFE_ERROR_SHARE = {"float64": 0.9, "float32": 0.6}
 """The share of an error that a run may have to be recommended; rounding differs from one compilation to the next."""
 TRUTH_ERROR_SHARE = 0.3
 """An error can be promised if the truth itself is right to this share of it."""
-CHAOTIC_GROWTH = 1e6
-"""Growth of an error of the start from which on one speaks of chaos; what drifts apart in time stays below."""
 ROUNDING_UNITS = 10
 """Rounding errors of the start, in units in the last place, that a run over many steps is taken to have."""
 
@@ -36,8 +34,7 @@ def explain_failure(task: SearchTask, found: list[Exploration], wanted: float, t
     horizon = truth.horizon(wanted, ROUNDING_UNITS * float(np.finfo(float).eps), task.norm, task.scale)
     least = min((t.error for entry in found for t in entry.trials), default=np.inf)
     if np.isfinite(horizon):
-        grown = float(truth.growth(task.norm, task.scale).max())
-        what = "Chaos" if grown > CHAOTIC_GROWTH else "Rounding"
+        what = "Chaos" if np.isfinite(truth.lyapunov_time(task.norm, task.scale)) else "Rounding"
         return f"{what}: beyond {format_seconds(horizon)} rounding alone has grown to an error of {wanted:g}; no method can."
     if truth_error > TRUTH_ERROR_SHARE * wanted:
         return _explain_uncertain_truth(task, wanted, truth_error)

@@ -225,6 +225,7 @@ def _build_recommendation(
         richardson=estimate_richardson_error(task, *kept[ranked[0]]) if kept else float("nan"),
         untried=untried,
         bound=bound_error(task, nearby, *kept[ranked[0]], truth_error) if kept else NO_BOUND,
+        lyapunov_time=task.truth.lyapunov_time(task.norm, task.scale),
     )
 
 

@@ -41,7 +41,8 @@ class Recommendation(NamedTuple):
 
     `best` is None, and `reason` says what stops it, where nothing keeps the error. `richardson` is the error of the best
     estimated from a run with half the step, `truth_error` that of the truth; `untried` the methods for which there was no
-    time. `bound` is an error that the best stays below from starts nearby, with a confidence.
+    time. `bound` is an error that the best stays below from starts nearby, with a confidence. `lyapunov_time` [s] is that
+    in which small errors of the start grow by e, where the motion is chaotic; infinite where it is not.
     """
 
     scene: Scene
@@ -57,6 +58,7 @@ class Recommendation(NamedTuple):
     richardson: float
     untried: tuple[str, ...]
     bound: ErrorBound = NO_BOUND
+    lyapunov_time: float = float("inf")
 
     @property
     def error_bound(self) -> float:
@@ -114,5 +116,7 @@ class Recommendation(NamedTuple):
             [format_table(["method", "float", "step", "error", "run time per s"], rows, align="<<>>>")] if rows else []
         )
         bounds = [f"Bound: {self.bound}."] if self.bound.starts else []
+        if np.isfinite(self.lyapunov_time):
+            bounds.append(f"Chaos: errors of the start grow by e each {format_seconds(self.lyapunov_time)}.")
         rest = [f"Not tried for lack of time: {', '.join(self.untried)}."] if self.untried else []
         return "\n".join([title, *body, f"{self.reason}", f"Evidence: {self.evidence}.", *bounds, *rest])

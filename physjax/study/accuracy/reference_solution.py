@@ -47,6 +47,12 @@ ROUNDING_EXTENT_SHARE = 1e-12
 """An extent, relative to the distance from the origin, that is rounding."""
 CONVERGED_ERROR_SHARE = 1 / 50
 """Our own solution is fine enough when a refinement changes it by this share of the error that is to be measured."""
+CHAOTIC_EFOLDINGS = 5.0
+"""How many times an error must grow by e over a run for one to speak of chaos."""
+CHAOTIC_GROWTH = 1e6
+"""Growth of an error of the start from which on one speaks of chaos, however it grew; what drifts apart stays below."""
+LARGEST_REGULAR_POWER = 2.5
+"""The power of time with which errors may grow where there is no chaos: t at a constant rate, t² under a constant push."""
 MAX_EXPONENT = 700.0
 """Exponents beyond this overflow float64."""
 
@@ -112,6 +118,27 @@ class ReferenceSolution(NamedTuple):
         if not over.any() or not self._is_proportional(norm, scale):
             return float("inf")
         return float(times[int(np.argmax(over))])
+
+    def lyapunov_time(self, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> float:
+        """The time [s] in which small errors of the start grow by a factor of e; infinite where the motion is not chaotic.
+
+        Chaotic is what grows by e⁵ over the run, and exponentially, or a millionfold. What drifts apart at a constant rate
+        grows as t, under a constant push as t²; five e-foldings look like t³ or more, from whichever moment of the second
+        quarter on. (Of an eccentric orbit errors are large at each pericentre: growth from one to the next is what counts.)
+        """
+        growth = np.maximum.accumulate(self.growth(norm, scale))
+        times = self.times[len(self.times) - len(growth) :]
+        far = growth * NUDGE_SHARE > SATURATED_SHARE  # two paths separate no further from there on
+        last = int(np.argmax(far)) if far.any() else len(far) - 1
+        first, until = (int(np.searchsorted(times, share * times[last])) for share in (0.25, 0.5))
+        if not np.isfinite(growth).all() or not 0 < first < until < last or not growth[first] > 0:
+            return float("inf")
+        time = times[last] / max(np.log(growth[last]), 1e-300)
+        early = slice(first, until + 1)
+        power = np.min(np.log(growth[last] / growth[early]) / np.log(times[last] / times[early]))
+        exponential = power > LARGEST_REGULAR_POWER or growth[last] > CHAOTIC_GROWTH
+        chaotic = times[-1] > CHAOTIC_EFOLDINGS * time and exponential
+        return float(time) if chaotic and self._is_proportional(norm, scale) else float("inf")
 
     def find_least_certain(self, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> int | None:
         """The unit (lane, or coupled scene) whose truth is least certain; None where there is one only, or a closed form."""

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, accuracy, contacts, forces, methods
+from physjax import Particles, Scene, accuracy, contacts, forces, methods, simulate
 from physjax.scenes import SCENES
 from physjax.study.accuracy import error_measures, recommend
+from physjax.study.accuracy.bounds import NEARBY_SHARE, bound_error, list_nearby
 from physjax.study.accuracy.compiled_run import compile_run
-from physjax.study.accuracy.reference_solution import solve_reference
+from physjax.study.accuracy.reference_solution import ReferenceSolution, nudge_start, solve_reference
+from physjax.study.accuracy.search import SearchTask, Trial
 from physjax.study.problem import Problem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -158,7 +160,7 @@ def test_errors_can_be_given_in_metres():
 
 
 def test_methods_without_time_are_reported():
-    advice = recommend(spring(), error=1e-4, horizon=10.0, seconds=1e-3, progress=False)
+    advice = recommend(spring(), error=1e-4, horizon=10.0, methods=FEW, seconds=1e-3, progress=False)
     assert advice.untried
     assert f"Not tried for lack of time: {', '.join(advice.untried)}." in str(advice)
 
@@ -259,3 +261,78 @@ def test_a_deviation_that_a_smaller_nudge_leaves_as_large_is_no_growth():
     assert jumpy.horizon(1e-6, 1e-15) == np.inf
     near = jax.tree.map(lambda a, b: a + (b - a) / 10, truth.states, noise)
     assert jumpy._replace(less_nudged=lambda: near).horizon(1e-6, 1e-15) < 4.0
+
+
+def test_the_error_of_a_start_nearby_stays_below_the_bound(swings):
+    """Of 40 other starts, nudged alike, nearly all: the bound is for 95 of 100."""
+    advice = swings[1]
+    assert advice.bound.starts == 19
+    assert advice.confidence == pytest.approx(0.95)
+    assert advice.best.error <= advice.error_bound < 1.5 * advice.best.error
+    assert f"Bound: {advice.error_bound:.1e} with 95% confidence" in str(advice)
+    random, omega = np.random.default_rng(5), 3.0
+    run = compile_swing(advice.best)
+    kept = []
+    for speed in random.normal(size=(40, 2)) * NEARBY_SHARE * omega:
+        flight = run(speed)
+        exact = np.cos(omega * flight.time)[:, None] * [1.0, 0.0] + np.sin(omega * flight.time)[:, None] * speed / omega
+        off = np.linalg.norm(np.asarray(flight.position) - exact, axis=-1).max() / 2
+        kept.append(off <= advice.error_bound)
+    assert np.mean(kept) >= 0.85
+
+
+def compile_swing(best):
+    """The recommended run of the swing from another start, which compiles once."""
+
+    def run(speed):
+        with jax.enable_x64(best.dtype == "float64"):
+            state = Particles(jnp.asarray([1.0, 0.0]), jnp.asarray(speed))
+            scene = Scene(state, forces=(forces.Anchor((0.0, 0.0), 9.0),))
+            return simulate(scene, best.method, dt=best.dt, duration=10.0, save_every=best.steps_per_frame)
+
+    return run
+
+
+def test_fewer_starts_give_less_confidence_and_no_time_gives_none():
+    with jax.enable_x64(True):
+        problem = Problem(spring(), 4.0, frames=8)
+        task = SearchTask(problem, solve_reference(problem), error_measures.path, None, None, np.inf)
+        entry = compile_run(problem, methods.rk4)
+        trial = Trial(8.0, task.error(entry(8.0)), 1e-3)
+        few = bound_error(task, list_nearby(task, 3, 60.0), entry, trial, 0.0)
+        none = bound_error(task, list_nearby(task, 3, 0.0), entry, trial, 0.0)
+    assert (few.starts, few.confidence) == (3, 0.75)
+    assert trial.error <= few.error < 2 * trial.error
+    assert (none.starts, none.confidence) == (0, 0.0)
+    assert np.isnan(none.error)
+
+
+def test_starts_nearby_differ_from_each_other_and_held_lanes_stay():
+    state = Particles(jnp.zeros((2, 2)), jnp.ones((2, 2)))
+    scene = Scene(state, forces=(forces.Gravity(),), pinned=np.asarray([True, False]))
+    states = jax.tree.map(lambda leaf: np.stack([leaf, 2 * leaf]), state)
+    moved = [np.asarray(nudge_start(scene, states, 0.01, seed=seed).state.velocity) for seed in (1, 2)]
+    assert (moved[0][1] != moved[1][1]).all()
+    assert all(np.abs(v[1] - 1).max() < 0.01 * 2 * 4 and (v[0] == 0).all() for v in moved)
+
+
+@pytest.mark.parametrize(
+    ("grow", "chaotic"),
+    [
+        (lambda t: np.exp(9 * t), True),
+        (lambda t: np.exp(4 * t), False),  # too slowly for the time
+        (lambda t: 1e4 * t, False),
+        (lambda t: 1e4 * t**2, False),
+        (lambda t: 5e3 * t * np.cos(2 * np.pi * t) ** 20, False),  # large where an orbit is close
+        (lambda t: np.where(t < 0.9, 1.0, 1e8), True),
+    ],
+)
+def test_chaos_is_exponential_growth_over_the_run(grow, chaotic):
+    times = np.linspace(0.0, 10.0, 33)
+    scene, still = spring(), np.zeros((33, 2))
+    line = still + [1.0, 0.0] * np.asarray(times)[:, None] / 10
+    off = lambda share: Particles(line + share * grow(times / 10)[:, None] * [0.0, 1.0], still)  # noqa: E731
+    truth = ReferenceSolution(
+        scene, times, Particles(line, still), None, off(1e-10), None, "", np.ones(1), lambda: off(1e-11)
+    )
+    assert np.isfinite(truth.lyapunov_time()) == chaotic
