@@ -17,7 +17,7 @@ from physjax.backend import read_work_clock
 from physjax.scene import Scene
 from physjax.stepping.registry import read_promises
 from physjax.study.accuracy.compiled_run import CompiledRun, compile_run
-from physjax.study.accuracy.forecast import estimate_pace, predict_seconds
+from physjax.study.accuracy.forecast import estimate_pace, predict_seconds, weigh_evaluations
 from physjax.study.accuracy.method_facts import (
     depends_on_velocity,
     list_adaptive_methods,
@@ -28,8 +28,9 @@ from physjax.study.accuracy.method_facts import (
 from physjax.study.accuracy.search import Exploration, SearchTask, explore_method
 from physjax.study.problem import Problem
 
-WORTHWHILE_GAIN = 1.25
-"""How many times as fast as the best so far a method must look to be compiled and run."""
+WORTHWHILE_GAIN, GAIN_PER_EVALUATION = 1.25, 0.02
+"""How many times as fast as the best so far a method must look to be compiled and run; and how much more for each evaluation
+written out in its program, since it takes that much longer to compile."""
 ROUGH_ERROR, ROUGH_ORDER = 1e-5, 6
 """Where no smaller error is asked for, methods of higher order cannot win: motion is not smooth over steps as long as theirs."""
 LARGEST_COMPARED_LIMIT = 1e6
@@ -37,7 +38,7 @@ LARGEST_COMPARED_LIMIT = 1e6
 
 
 class Candidate(NamedTuple):
-    """A method and the power of the number of steps with which its errors promise to fall on the scene."""
+    """A method and the power of the number of steps with which its errors are expected to fall on the scene."""
 
     method: Callable
     order: float
@@ -53,7 +54,8 @@ def list_candidates(scene: Scene, least: float = 0.0) -> list[Callable]:
     def rate_merit(method: Callable) -> tuple[float, ...]:
         promises = method.promises  # every method of the registry has them
         limit = min(promises.stability_limit, LARGEST_COMPARED_LIMIT)
-        return promised_order(method, velocity_dependent, scene), -promises.evaluations, limit
+        # of two that drag lowers alike, the one with the higher order without it
+        return promised_order(method, velocity_dependent, scene), -promises.evaluations, limit, promises.order
 
     possible = [m for m in list_methods(scene).values() if m.promises.order <= ROUGH_ORDER or least < ROUGH_ERROR]
     chosen: list[Callable] = []
@@ -77,9 +79,14 @@ def _is_implicit(method: Callable) -> bool:
 
 
 def rate_candidates(scene: Scene, methods: Sequence[Callable]) -> list[Candidate]:
-    """Methods with what they promise on a scene."""
-    velocity_dependent = depends_on_velocity(scene)
-    return [Candidate(method, promised_order(method, velocity_dependent, scene)) for method in methods]
+    """Methods with the orders to be expected on a scene.
+
+    Drag that lowers an order is often weak: errors then fall as without it until they are small. In between is halfway.
+    """
+    ends = {False, depends_on_velocity(scene)}
+    return [
+        Candidate(method, float(np.mean([promised_order(method, end, scene) for end in ends]))) for method in methods
+    ]
 
 
 class Ready(NamedTuple):
@@ -125,14 +132,14 @@ def explore_methods(
     found: list[Exploration] = []
     waiting, longest = list(candidates), 0.0
     while waiting and goals:
-        gains = [_predict_gain(task, candidate, found, goals) for candidate in waiting]
+        gains = [_predict_gain(task, candidate, found, goals) / _least_gain(candidate) for candidate in waiting]
         free = [i for i, candidate in enumerate(waiting) if _find_compiled(ready, candidate) is not None]
         i = free[0] if free else 0 if everything else int(np.argmax(gains))
-        if not (free or everything) and gains[i] < WORTHWHILE_GAIN:
+        if not (free or everything) and gains[i] < 1:
             break
         # as much again is needed to verify
         if found and 2 * longest > task.time_left():
-            late = [c for c, gain in zip(waiting, gains, strict=True) if everything or gain >= WORTHWHILE_GAIN]
+            late = [c for c, gain in zip(waiting, gains, strict=True) if everything or gain >= 1]
             return found, tuple(method_title(candidate.method) for candidate in late)
         candidate = waiting.pop(i)
         bar.set_postfix_str(method_title(candidate.method))
@@ -154,6 +161,12 @@ def _list_compiled(task: SearchTask, ahead: Ready | None) -> list[Ready]:
 
 def _find_compiled(ready: Sequence[Ready], candidate: Candidate) -> Callable[[], CompiledRun] | None:
     return next((each.get for each in ready if each.method is candidate.method), None)
+
+
+def _least_gain(candidate: Candidate) -> float:
+    """How many times as fast as the best so far a method must look to be worth its compilation."""
+    _, written = weigh_evaluations(candidate.method)
+    return WORTHWHILE_GAIN + GAIN_PER_EVALUATION * written
 
 
 def _predict_gain(

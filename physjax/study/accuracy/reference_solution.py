@@ -38,7 +38,7 @@ FIRST_STEPS_PER_FRAME = 8
 NUDGE_SHARE = 1e-10
 """The change of the start, relative to the path, whose growth is measured: far from rounding and from curvature."""
 NUDGE_RATIO = 10.0
-"""A second nudge, this many times smaller, confirms growth: what the nudge has caused is then as many times smaller."""
+"""A second nudge, this many times larger, confirms growth: what the nudge has caused is then as many times larger."""
 SATURATED_SHARE = 1e-3
 """The size of a deviation, relative to the path, from which it no longer grows like a small one."""
 INTERMEDIATE_TIME_RATIO = (1 + 5**0.5) / 4
@@ -61,8 +61,8 @@ class ReferenceSolution(NamedTuple):
     """States at the moments, those of a second, coarser solution, and those from a start that was nudged.
 
     `second` and `nudged` are None where the states are a closed form. `slopes` is the derivative along a push of the start.
-    `reach` is how far each unit goes, at the moments and in between. `less_nudged()` solves from a start that was nudged
-    by a tenth of that, `solve_start(scene)` solves from any, states and slopes, and takes about `seconds` [s].
+    `reach` is how far each unit goes, at the moments and in between. `more_nudged()` solves from a start that was nudged
+    ten times as far, `solve_start(scene)` solves from any, states and slopes, and takes about `seconds` [s].
     `compiled_run` is what it was solved by, where that is a method of our own; `steps` between two moments are those of
     diffrax otherwise.
     """
@@ -75,7 +75,7 @@ class ReferenceSolution(NamedTuple):
     slopes: PyTree
     source: str
     reach: np.ndarray | None = None
-    less_nudged: Callable[[], PyTree] | None = None
+    more_nudged: Callable[[], PyTree] | None = None
     solve_start: Callable[[Scene], tuple[PyTree, PyTree]] | None = None
     seconds: float = 0.0
     compiled_run: CompiledRun | None = None
@@ -101,7 +101,7 @@ class ReferenceSolution(NamedTuple):
     def horizon(self, error: float, eps: float, norm: ErrorMeasure = path, scale: ArrayLike | None = None) -> float:
         """The first moment [s] at which rounding of size `eps` has grown beyond an error; infinite if it does not.
 
-        Where the nudged path is not known, or as far away when nudged by a tenth, nothing is known to have grown.
+        Where the nudged path is not known, or no farther away when nudged more, nothing is known to have grown.
         """
         growth = self.growth(norm, scale)
         if not np.isfinite(growth).all():
@@ -153,14 +153,14 @@ class ReferenceSolution(NamedTuple):
         return self.reach if scale is None and norm.size is extent else scale
 
     def _is_proportional(self, norm: ErrorMeasure, scale: ArrayLike | None) -> bool:
-        """Whether a smaller nudge leads less far away, at the last moment at which the larger was still small.
+        """Whether a larger nudge leads farther away, at the last moment at which what it causes is still small.
 
         Where it does not, as with dry friction, the deviation is noise of the solver and says nothing about growth.
         """
-        if self.less_nudged is None:
+        if self.more_nudged is None:
             return True
-        far = self._measure_deviation(self.nudged, norm, scale)
-        near = self._measure_deviation(self.less_nudged(), norm, scale)
+        near = self._measure_deviation(self.nudged, norm, scale)
+        far = self._measure_deviation(self.more_nudged(), norm, scale)
         small = (far > 0) & (far < SATURATED_SHARE)
         if not small.any():
             return True
@@ -247,7 +247,7 @@ def _build_reference(problem: Problem, scene: Scene, solver: _Solver, strict: bo
     solve_nudged = lambda share: solver.solve_start(nudge_start(scene, visited, share))[0]  # noqa: E731
     reach = _measure_reach(scene, problem.times, states, between)
     # asked for once for each error, if at all
-    less, started = cache(partial(solve_nudged, NUDGE_SHARE / NUDGE_RATIO)), read_work_clock()
+    more, started = cache(partial(solve_nudged, NUDGE_SHARE * NUDGE_RATIO)), read_work_clock()
     moved = solve_nudged(NUDGE_SHARE)
     seconds = read_work_clock() - started
     if not finite(moved):
@@ -261,7 +261,7 @@ def _build_reference(problem: Problem, scene: Scene, solver: _Solver, strict: bo
         found.slopes,
         found.source,
         reach,
-        less,
+        more,
         solver.solve_start,
         seconds,
         solver.compiled_run,
