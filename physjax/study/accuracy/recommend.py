@@ -70,10 +70,13 @@ def recommend(
     with contacts, forces that remember or more than 20 000 numbers, our rk4 with far finer steps, judged by Richardson:
     the answer says which. `methods`: those of the registry that suit the scene, with equal steps and, where they know their
     errors, with steps of their own, unless given; those that promise no more than another in any respect are left out,
-    adaptive ones also where there are contacts, implicit ones where accuracy limits the step before stability does.
+    adaptive ones also where there are contacts, implicit ones where accuracy limits the step before stability does, and
+    what the runs of others show to be slower is not even compiled.
     `seconds` of processor time (of wall-clock time where the work is not on a CPU) bound the search: what is not reached
     is reported. Everything rarer is a field of `accuracy.SearchOptions`, accepted as a keyword as well: `gradient`,
     `scale`, `dtypes`, `frames`, `progress`.
+    Each answer has a bound on its error with a confidence (`error_bound`), from runs of starts that differ by a percent, and
+    says where motion is chaotic (`lyapunov_time`).
     Raises ValueError or TypeError for bad input; where nothing keeps the error, the answer says what stops it.
 
     Example:

@@ -10,6 +10,7 @@ from physjax.study.accuracy import error_measures
 from physjax.study.accuracy.compiled_run import compile_run
 from physjax.study.accuracy.exploring import Candidate, explore_methods
 from physjax.study.accuracy.forecast import Costs, Pace, estimate_pace, predict_seconds
+from physjax.study.accuracy.method_facts import depends_on_velocity
 from physjax.study.accuracy.reference_solution import solve_reference
 from physjax.study.accuracy.search import Exploration, SearchTask, Trial
 from physjax.study.problem import Problem
@@ -84,6 +85,13 @@ def test_methods_need_the_steps_that_their_promises_predict(method):
         error = measure(method, count)
     predicted = difficulty * error ** (-1 / method.promises.order) / method.promises.relative_step
     assert count / 3 < predicted < 3 * count
+
+
+@pytest.mark.parametrize("speed", [0.5, 3.0, 50.0])
+def test_dry_friction_is_seen_to_depend_on_velocity_however_fast_a_body_is(speed):
+    friction = forces.independent(lambda t, s, m: -2.0 * jnp.sign(s.velocity))
+    assert depends_on_velocity(Scene(Particles(jnp.zeros(1), jnp.full(1, speed)), forces=(friction,)))
+    assert not depends_on_velocity(Scene(Particles(jnp.zeros(1), jnp.full(1, speed)), forces=(forces.Gravity(up=0),)))
 
 
 @pytest.mark.slow
