@@ -45,6 +45,7 @@ class ErrorBound(NamedTuple):
 
 
 NO_BOUND = ErrorBound(float("nan"), 0.0, 0)
+"""Where no start nearby was run."""
 
 
 class Nearby(NamedTuple):
