@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from physjax.physics.forces import flows as fields
     from physjax.physics.rigid import inertia
     from physjax.physics.rigid.inertia import Inertia
+    from physjax.physics.rigid.planar import PlanarBodies
     from physjax.physics.rigid.spatial import RigidBodies
     from physjax.physics.springs import lattices
     from physjax.show import animate, export, plot
@@ -67,6 +68,7 @@ __all__ = [
     "Inertia",
     "Particles",
     "Pins",
+    "PlanarBodies",
     "RigidBodies",
     "Scene",
     "Trajectory",
@@ -110,6 +112,7 @@ __version__ = "0.1.0"
 # Where the names are that are loaded when they are first used: what not every run needs should not slow the import.
 _LAZY = {
     "Inertia": "physjax.physics.rigid.inertia:Inertia",
+    "PlanarBodies": "physjax.physics.rigid:PlanarBodies",
     "RigidBodies": "physjax.physics.rigid:RigidBodies",
     "accuracy": "physjax.study.accuracy",
     "aim_at": "physjax.study.inverse.aim:aim_at",

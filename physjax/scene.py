@@ -324,7 +324,11 @@ class Scene(eqx.Module):
 
     def finite(self, state: PyTree) -> Bool[Array, "..."]:
         """Whether the state is finite, per lane, or per scene where lanes are coupled."""
-        status = [jnp.all(jnp.isfinite(leaf), axis=-1) for leaf in jax.tree.leaves(state)]
+        lanes = len(state.lanes)
+        status = [
+            jnp.all(jnp.isfinite(leaf), axis=-1) if leaf.ndim > lanes else jnp.isfinite(leaf)
+            for leaf in jax.tree.leaves(state)
+        ]
         good = jnp.all(jnp.stack(status), axis=0)
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
 

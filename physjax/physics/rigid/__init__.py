@@ -25,6 +25,7 @@ from physjax.physics.rigid.loads import (
     point_velocity,
 )
 from physjax.physics.rigid.pairs import Balls
+from physjax.physics.rigid.planar import PlanarBodies, PlanarInertia, PlanarShape, Solids, planar_bodies
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_acceleration, angular_velocity
 from physjax.physics.rigid.surface_contact import Hull, SurfaceContact, Touch
 
@@ -35,8 +36,12 @@ __all__ = [
     "Hull",
     "Joints",
     "Load",
+    "PlanarBodies",
+    "PlanarInertia",
+    "PlanarShape",
     "RigidBodies",
     "RotationalDrag",
+    "Solids",
     "SurfaceContact",
     "Thrust",
     "Torque",
@@ -47,6 +52,7 @@ __all__ = [
     "bodies",
     "hinge",
     "on_bodies",
+    "planar_bodies",
     "point",
     "point_acceleration",
     "point_velocity",

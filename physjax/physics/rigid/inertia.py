@@ -23,6 +23,15 @@ from physjax.physics.rigid.inertia_tensors import (
     shift_inertia,
     turn_tensor,
 )
+from physjax.physics.rigid.planar_inertia import (
+    PlanarInertia,
+    PlanarSolid,
+    planar_capsule,
+    planar_disc,
+    planar_plate,
+    planar_polygon,
+    planar_segment,
+)
 from physjax.vectors import components, dot, scale
 
 FLAT_VOLUME_SHARE = 1e-12
@@ -367,6 +376,8 @@ def _build_axial(mass: ArrayLike, axis: int, about: Array, across: Array) -> Ine
 
 __all__ = [
     "Inertia",
+    "PlanarInertia",
+    "PlanarSolid",
     "Solid",
     "box",
     "capsule",
@@ -374,6 +385,11 @@ __all__ = [
     "cylinder",
     "mesh",
     "of_tensor",
+    "planar_capsule",
+    "planar_disc",
+    "planar_plate",
+    "planar_polygon",
+    "planar_segment",
     "points",
     "rod",
     "sphere",

@@ -1,0 +1,99 @@
+"""Impacts: the velocities after all contacts that approach have bounced, those that arrive together together.
+
+In each round, over the contacts that approach: v_n' >= -K_r v_n, impulses >= 0, and either is zero; friction takes at most
+μ times the normal impulse. Rounds are repeated until none approaches. All touching points at once would send a cradle
+off as (-0.6, 0.4, 0.4, 0.4, 0.4): with the right energy and momentum, and wrong.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from physjax.loops import differentiable_while_loop
+from physjax.physics.rigid.planar.impulses import (
+    Contacts,
+    Demand,
+    Impulses,
+    Velocity,
+    measure_speeds,
+    sweep_contacts,
+)
+from physjax.physics.rigid.planar.pairs import Groups
+
+MAX_ROUNDS = 256
+"""Most rounds of a sub-step: an impact goes through a row of this many bodies."""
+MAX_SWEEPS = 4096
+"""Most sweeps over the contacts of a round."""
+ROUNDING = 64
+"""Speeds relative to the fastest, in units of rounding, that are none."""
+CONVERGED = 4
+"""Changes of speed in a sweep relative to the fastest, in units of rounding, that are none."""
+
+
+class Bouncing(NamedTuple):
+    """Contacts that may bounce, in groups: which points do, their K_r, and the speeds of approach [m/s] beyond which they do.
+
+    A point bounces that is faster than `slow`, and fast enough to reach the other side in the sub-step (`reach`).
+    """
+
+    may: tuple[Array, Array]
+    restitution: Array
+    slow: tuple[Array, Array]
+    reach: tuple[Array, Array]
+
+
+class _Round(NamedTuple):
+    velocity: Velocity
+    impulses: Impulses
+    change: Array
+
+
+def resolve_impacts(velocity: Velocity, groups: Groups, contacts: Contacts, bouncing: Bouncing) -> Velocity:
+    """Velocities of all rows after the impacts."""
+
+    def find_approaching(velocity: Velocity) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        speeds = measure_speeds(velocity, groups, contacts)
+        rounding = _round_speed(velocity, ROUNDING)
+        cases = zip(bouncing.may, speeds, bouncing.slow, bouncing.reach, strict=True)
+        first, second = (may & (-v > jnp.maximum(slow + rounding, reach)) for may, v, slow, reach in cases)
+        return (first, second), speeds
+
+    def is_going(carry: tuple[Velocity, Array]) -> Array:
+        first, second = find_approaching(carry[0])[0]
+        return jnp.any(first | second, axis=(0, 1)) & (carry[1] < MAX_ROUNDS)
+
+    def bounce(carry: tuple[Velocity, Array]) -> tuple[Velocity, Array]:
+        velocity, rounds = carry
+        active, (first, second) = find_approaching(velocity)
+        demand = Demand.hard((-bouncing.restitution * first, -bouncing.restitution * second), active)
+        return _solve_round(velocity, groups, contacts, demand), rounds + 1
+
+    rounds = jnp.zeros(velocity[0].shape[-1:], jnp.int32)
+    return differentiable_while_loop(is_going, bounce, (velocity, rounds), most=MAX_ROUNDS)[0]
+
+
+def _solve_round(velocity: Velocity, groups: Groups, contacts: Contacts, demand: Demand) -> Velocity:
+    """Velocities after the contacts that are active separate with the speeds asked for; the others are not there."""
+    tolerance = _round_speed(velocity, CONVERGED)
+    # an impulse changes the speed of a contact by at least that much
+    lightness = contacts.mass[0] + contacts.mass[1]
+
+    def sweep(carry: _Round) -> _Round:
+        velocity, impulses = sweep_contacts(carry.velocity, groups, contacts, demand, carry.impulses)
+        moved = [jnp.abs(new - old) for new, old in zip(impulses, carry.impulses, strict=True)]
+        most = jnp.maximum(jnp.maximum(moved[0], moved[1]), moved[2])
+        return _Round(velocity, impulses, jnp.max(lightness * most, axis=(0, 1)))
+
+    none = jnp.zeros_like(demand.speed[0])
+    start = _Round(velocity, (none, none, none), jnp.full(none.shape[-1:], jnp.inf, none.dtype))
+    return differentiable_while_loop(lambda carry: carry.change > tolerance, sweep, start, most=MAX_SWEEPS).velocity
+
+
+def _round_speed(velocity: Velocity, units: int) -> Array:
+    """So many units of rounding of the fastest of each world [m/s]."""
+    x, y, _ = velocity
+    return units * float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(y)), axis=0)
+
+
+__all__ = ["Bouncing", "resolve_impacts"]

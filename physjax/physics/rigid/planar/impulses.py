@@ -1,0 +1,244 @@
+"""The impulses at all contacts: group after group, each contact of a group at the same time.
+
+A contact asks for a speed of separation along its normal, softly or not, with impulses that only push; friction stops
+the slip, with at most μ times those. What a sweep asks for is its `Demand`: the places after a sub-step, the
+velocities at its end, and the speeds after an impact are found by the same sweep.
+
+A contact has one normal and one or two points, and so three directions: the tangent, in which the friction at both points
+acts along one line, and the normal at each point.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from physjax.physics.rigid.planar.manifolds import Vector
+from physjax.physics.rigid.planar.pairs import Groups
+
+MIN_DETERMINANT_SHARE = 1e-3
+"""Share of the product of its diagonal below which the matrix of two points has none: they are as good as one."""
+
+ALTERNATIONS = 2
+"""Of normal and friction within a contact."""
+
+Sides = tuple[Array, Array]
+"""The same number of both bodies of each contact."""
+Points = tuple[Array, Array]
+"""The same number at both points of each contact."""
+Velocity = tuple[Array, Array, Array]
+"""Velocities of bodies along x and y [m/s] and of their angles [rad/s], each `(bodies, worlds)`."""
+Impulses = tuple[Array, Array, Array]
+"""Impulses [N s] of contacts along the tangent and along the normal at both points, each `(contacts, worlds)`."""
+
+
+class Contacts(NamedTuple):
+    """All contacts of a step as the solver sees them; every array is `(contacts, worlds)`, or in groups with these in front.
+
+    `normal` points from a to b; the tangent is the normal turned left. `torque` is what unit impulses along the three
+    directions turn a and b by [m]; `carried` the speed of b's surface along the tangent and the normal [m/s]; `coupling` by
+    how much a unit impulse along one direction changes the speed along another [1/kg]: tangent with itself and both
+    normals, first normal with itself and the second, second with itself. `mass` and `moment` are the inverse ones of both
+    bodies [1/kg, 1/(kg m²)], `friction` is μ, and `is_point` says which of the two are points.
+    """
+
+    normal: Vector
+    torque: tuple[Impulses, Impulses]
+    carried: Vector
+    coupling: tuple[Array, ...]
+    mass: Sides
+    moment: Sides
+    friction: Array
+    is_point: Points
+
+
+class Demand(NamedTuple):
+    """What a sweep asks of each point: its speed of separation [m/s] at least, and how.
+
+    A point that `yields` is asked softly: its impulse is less by as much as a spring gives way (`Softness`). Where it is not
+    `active` there is no impulse.
+    """
+
+    speed: Points
+    yields: Points
+    active: Points
+
+    @classmethod
+    def hard(cls, speed: Points, active: Points) -> "Demand":
+        """These speeds, of those that are active."""
+        none = jnp.zeros_like(active[0])
+        return cls(speed, (none, none), active)
+
+
+class Softness(NamedTuple):
+    """A contact spring and damper as numbers of a solver: the share of an overlap cured in a sub-step, and how it yields.
+
+    With ω h and ζ, cure = ωh/(2ζ + ωh), and the impulse is that of a hard contact whose matrix has a diagonal larger by the
+    factor `yielding` = 1 + 1/(ωh (2ζ + ωh)): E. Catto, "Soft Constraints" (2011).
+    """
+
+    cure: float
+    yielding: float
+
+    @classmethod
+    def of(cls, periods: float, damping_ratio: float) -> "Softness":
+        """Of a spring with a period of as many sub-steps."""
+        angle = 6.283185307179586 / periods
+        return cls(angle / (2 * damping_ratio + angle), 1 + 1 / (angle * (2 * damping_ratio + angle)))
+
+
+SOFT = Softness.of(periods=2.0, damping_ratio=0.5)
+"""As stiff as a sub-step resolves: with a longer period towers lean and sway, and with more damping they take longer to stop."""
+
+
+def build_contacts(
+    normal: Vector,
+    arm: tuple[Vector, Vector],
+    carried: Vector,
+    mass: Sides,
+    moment: Sides,
+    friction: Array,
+    is_point: Array,
+) -> Contacts:
+    """Contacts from normals `(contacts, worlds)`, arms to both points `(2, ...)`, and the velocity of b's surface [m/s]."""
+    nx, ny = normal
+    # of two points the line of friction goes through the middle
+    middle = lambda c: jnp.where(is_point[1], (c[0] + c[1]) / 2, c[0])  # noqa: E731
+    turn = lambda ax, ay: (middle(ax) * nx + middle(ay) * ny, *(ax * ny - ay * nx))  # noqa: E731
+    ta, tb = torque = (turn(*arm[0]), turn(*arm[1]))
+    along, across = carried[0] * nx + carried[1] * ny, carried[1] * nx - carried[0] * ny
+    shared, (ia, ib) = mass[0] + mass[1], moment
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    parallel = lambda i, j: 0.0 if (i == 0) != (j == 0) else shared  # noqa: E731
+    coupling = tuple(parallel(i, j) + ia * ta[i] * ta[j] + ib * tb[i] * tb[j] for i, j in pairs)
+    points = (is_point[0], is_point[1])
+    return Contacts(normal, torque, (across, along), coupling, mass, moment, friction, points)
+
+
+def sweep_contacts(
+    velocity: Velocity, groups: Groups, contacts: Contacts, demand: Demand, impulses: Impulses
+) -> tuple[Velocity, Impulses]:
+    """Velocities of all rows and impulses of all groups after each contact was solved once, group after group.
+
+    The velocities are those that the impulses given have brought about. Each array is one component: XLA on a CPU computes
+    what is stacked once for every part of it, and without vector instructions.
+    """
+
+    def solve(velocity: Velocity, group: tuple) -> tuple[Velocity, Impulses]:
+        (a, b), contacts, demand, impulses = group
+        ends = _pick_rows(velocity, a), _pick_rows(velocity, b)
+        new = _solve_contact(_find_speeds(ends, contacts), contacts, demand, impulses)
+        change = find_changes(contacts, _map(jnp.subtract, new, impulses))
+        for rows, end, more in zip((a, b), ends, change, strict=True):
+            write = lambda part, e, m, rows=rows: part.at[rows].set(e + m, unique_indices=True)  # noqa: E731
+            velocity = _map(write, velocity, end, more)
+        return velocity, new
+
+    rows = jnp.asarray(groups.a), jnp.asarray(groups.b)
+    return lax.scan(solve, velocity, (rows, contacts, demand, impulses))
+
+
+def _pick_rows(velocity: Velocity, rows: Array) -> Velocity:
+    return _map(lambda part: part[rows], velocity)
+
+
+def _map(function: Callable[..., Array], *parts: tuple[Any, Any, Any]) -> tuple[Array, Array, Array]:
+    """The function of three components, one by one."""
+    x, y, z = (function(*each) for each in zip(*parts, strict=True))
+    return x, y, z
+
+
+def _find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Impulses:
+    """How fast b moves away from a along each direction [m/s]."""
+    ((ax, ay, aw), (bx, by, bw)), (nx, ny), (across, along) = ends, contacts.normal, contacts.carried
+    dx, dy = bx - ax, by - ay
+    turning = _map(lambda a, b: b * bw - a * aw, *contacts.torque)
+    straight = nx * dx + ny * dy - along
+    return nx * dy - ny * dx - across + turning[0], straight + turning[1], straight + turning[2]
+
+
+def find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
+    """What impulses on b, and the opposite ones on a, change in the velocities of both."""
+    (nx, ny), across, along = contacts.normal, impulses[0], impulses[1] + impulses[2]
+    px, py = nx * along - ny * across, ny * along + nx * across
+    sa, sb = (sum(arm * impulse for arm, impulse in zip(torque, impulses, strict=True)) for torque in contacts.torque)
+    (ma, mb), (ia, ib) = contacts.mass, contacts.moment
+    return (-ma * px, -ma * py, -ia * sa), (mb * px, mb * py, ib * sb)
+
+
+def _solve_contact(speed: Impulses, contacts: Contacts, demand: Demand, impulses: Impulses) -> Impulses:
+    """The impulses of each contact: both normals together, then friction with what they press."""
+    own, first, second, *matrix = contacts.coupling
+    there = [is_point & active for is_point, active in zip(contacts.is_point, demand.active, strict=True)]
+    inverse = 1 / jnp.where(own > 0, own, jnp.inf)
+    grip, *press = impulses
+    for _ in range(ALTERNATIONS):
+        short = [demand.speed[k] - speed[k + 1] for k in range(2)]
+        pressed = _press_both(matrix, short, press, demand.yields, there)
+        more = [new - old for new, old in zip(pressed, press, strict=True)]
+        slip = speed[0] + first * more[0] + second * more[1]
+        most = contacts.friction * (pressed[0] + pressed[1])
+        held = jnp.where(there[0] | there[1], jnp.clip(grip - slip * inverse, -most, most), 0.0)
+        changes = held - grip, *more
+        rows = (own, first, second), (first, matrix[0], matrix[1]), (second, matrix[1], matrix[2])
+        speed = _map(lambda v, row, c=changes: v + row[0] * c[0] + row[1] * c[1] + row[2] * c[2], speed, rows)
+        grip, press = held, list(pressed)
+    return grip, press[0], press[1]
+
+
+def _press_both(
+    matrix: list[Array], short: list[Array], press: list[Array], yields: Points, there: list[Array]
+) -> Points:
+    """The normal impulses x >= 0 of two points with K x >= b, where either is met: solved exactly, as a box rocks.
+
+    K holds the changes of speed by unit impulses; softness makes its diagonal larger.
+    """
+    aa, ab, bb = matrix
+    aa, bb = (jnp.where(own > 0, own, 1.0) for own in (aa, bb))
+    soft_a, soft_b = (jnp.where(yields[k], SOFT.yielding * own, own) for k, own in enumerate((aa, bb)))
+    wanted_a = jnp.where(there[0], short[0] + aa * press[0] + ab * press[1], -1.0)
+    wanted_b = jnp.where(there[1], short[1] + bb * press[1] + ab * press[0], -1.0)
+    determinant = soft_a * soft_b - ab * ab
+    regular = determinant > MIN_DETERMINANT_SHARE * soft_a * soft_b
+    inverse = 1 / jnp.where(regular, determinant, jnp.inf)
+    both_a, both_b = inverse * (soft_b * wanted_a - ab * wanted_b), inverse * (soft_a * wanted_b - ab * wanted_a)
+    both = regular & (both_a >= 0) & (both_b >= 0)
+    only_a, only_b = jnp.maximum(wanted_a / soft_a, 0.0), jnp.maximum(wanted_b / soft_b, 0.0)
+    a_alone = ab * only_a >= wanted_b
+    return (
+        jnp.where(both, both_a, jnp.where(a_alone, only_a, 0.0)),
+        jnp.where(both, both_b, jnp.where(a_alone, 0.0, only_b)),
+    )
+
+
+def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Points:
+    """How fast both points of every contact move apart [m/s]."""
+
+    def measure(group: tuple) -> Points:
+        (a, b), contacts = group
+        return _find_speeds((_pick_rows(velocity, a), _pick_rows(velocity, b)), contacts)[1:]
+
+    return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
+
+
+def sum_impulses(contacts: Contacts, impulses: Impulses, incidence: Sides) -> Velocity:
+    """What impulses change in the velocities of all bodies; `incidence` says of which contacts each is a and b."""
+    (on_a, on_b), (of_a, of_b) = incidence, find_changes(contacts, impulses)
+    exact = lax.Precision.HIGHEST
+    return _map(lambda a, b: jnp.dot(on_a, a, precision=exact) + jnp.dot(on_b, b, precision=exact), of_a, of_b)
+
+
+__all__ = [
+    "SOFT",
+    "Contacts",
+    "Demand",
+    "Impulses",
+    "Velocity",
+    "build_contacts",
+    "find_changes",
+    "measure_speeds",
+    "sum_impulses",
+    "sweep_contacts",
+]
