@@ -107,7 +107,7 @@ def planar_polygon(mass: ArrayLike, corners: NestedArrayLike) -> PlanarSolid:
     corners = as_real_quantity("corners [m]", corners)
     demand_convex_corners(corners)
     middle = jnp.mean(corners, axis=0)  # far from the origin the sums would cancel
-    a = corners - middle
+    a = corners - middle[None]
     b = jnp.roll(a, -1, axis=0)
     area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     center = jnp.sum(area[:, None] * (a + b), axis=0) / (3 * jnp.sum(area))

@@ -1,7 +1,8 @@
 """Impacts: the velocities after all contacts that approach have bounced, those that arrive together together.
 
-In each round, over the contacts that approach: v_n' >= -K_r v_n, impulses >= 0, and either is zero; friction takes at most
-μ times the normal impulse. Rounds are repeated until none approaches. All touching points at once would send a cradle
+In each round, over the contacts that approach fast enough to close their gap in the sub-step: v_n' >= -K_r v_n, impulses
+>= 0, and either is zero; friction takes at most μ times the normal impulse. What would rebound too slowly to be told from
+rest keeps the speed that closes its gap. Rounds are repeated until none approaches so fast. All touching points at once would send a cradle
 off as (-0.6, 0.4, 0.4, 0.4, 0.4): with the right energy and momentum, and wrong.
 """
 
@@ -21,25 +22,26 @@ from physjax.physics.rigid.planar.impulses import (
 )
 from physjax.physics.rigid.planar.pairs import Groups
 
-MAX_ROUNDS = 256
+MAX_ROUNDS = 64
 """Most rounds of a sub-step: an impact goes through a row of this many bodies."""
-MAX_SWEEPS = 4096
-"""Most sweeps over the contacts of a round."""
+MAX_SWEEPS = 256
+"""Most sweeps over the contacts of a round: what is left of a hit on a high pile is for the next sub-steps."""
+REACH = 1 + 1e-4
+"""Factor of the way in a sub-step within which a contact is reached: what just closes its gap bounces, and does not stop."""
 ROUNDING = 64
 """Speeds relative to the fastest, in units of rounding, that are none."""
-CONVERGED = 4
+CONVERGED = 16
 """Changes of speed in a sweep relative to the fastest, in units of rounding, that are none."""
 
 
 class Bouncing(NamedTuple):
-    """Contacts that may bounce, in groups: which points do, their K_r, and the speeds of approach [m/s] beyond which they do.
+    """What decides of contacts in groups whether they bounce: their K_r, and two speeds of approach [m/s].
 
-    A point bounces that is faster than `slow`, and fast enough to reach the other side in the sub-step (`reach`).
+    A point bounces that is faster than `slow` of its world, and than its `reach`: what closes its gap in the sub-step.
     """
 
-    may: tuple[Array, Array]
     restitution: Array
-    slow: tuple[Array, Array]
+    slow: Array
     reach: tuple[Array, Array]
 
 
@@ -54,9 +56,9 @@ def resolve_impacts(velocity: Velocity, groups: Groups, contacts: Contacts, boun
 
     def find_approaching(velocity: Velocity) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         speeds = measure_speeds(velocity, groups, contacts)
-        rounding = _round_speed(velocity, ROUNDING)
-        cases = zip(bouncing.may, speeds, bouncing.slow, bouncing.reach, strict=True)
-        first, second = (may & (-v > jnp.maximum(slow + rounding, reach)) for may, v, slow, reach in cases)
+        rounding, slow = _round_speed(velocity, ROUNDING)[None, None], bouncing.slow[None, None]
+        cases = zip(contacts.is_point, speeds, bouncing.reach, strict=True)
+        first, second = (there & (-v > slow + rounding) & (-v * REACH > reach) for there, v, reach in cases)
         return (first, second), speeds
 
     def is_going(carry: tuple[Velocity, Array]) -> Array:
@@ -65,8 +67,15 @@ def resolve_impacts(velocity: Velocity, groups: Groups, contacts: Contacts, boun
 
     def bounce(carry: tuple[Velocity, Array]) -> tuple[Velocity, Array]:
         velocity, rounds = carry
-        active, (first, second) = find_approaching(velocity)
-        demand = Demand.hard((-bouncing.restitution * first, -bouncing.restitution * second), active)
+        active, speeds = find_approaching(velocity)
+        rebounds = [-bouncing.restitution * v for v in speeds]
+        slow = bouncing.slow[None, None]
+        # what has closed its gap already closes it no further
+        first, second = (
+            jnp.where(back > slow, back, -jnp.maximum(reach, 0.0))
+            for back, reach in zip(rebounds, bouncing.reach, strict=True)
+        )
+        demand = Demand.hard((first, second), active)
         return _solve_round(velocity, groups, contacts, demand), rounds + 1
 
     rounds = jnp.zeros(velocity[0].shape[-1:], jnp.int32)

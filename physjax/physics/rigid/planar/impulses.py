@@ -106,7 +106,7 @@ def build_contacts(
     nx, ny = normal
     # of two points the line of friction goes through the middle
     middle = lambda c: jnp.where(is_point[1], (c[0] + c[1]) / 2, c[0])  # noqa: E731
-    turn = lambda ax, ay: (middle(ax) * nx + middle(ay) * ny, *(ax * ny - ay * nx))  # noqa: E731
+    turn = lambda ax, ay: (middle(ax) * nx + middle(ay) * ny, *(ax * ny[None] - ay * nx[None]))  # noqa: E731
     ta, tb = torque = (turn(*arm[0]), turn(*arm[1]))
     along, across = carried[0] * nx + carried[1] * ny, carried[1] * nx - carried[0] * ny
     shared, (ia, ib) = mass[0] + mass[1], moment
@@ -224,10 +224,10 @@ def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Po
 
 
 def sum_impulses(contacts: Contacts, impulses: Impulses, incidence: Sides) -> Velocity:
-    """What impulses change in the velocities of all bodies; `incidence` says of which contacts each is a and b."""
+    """What impulses in groups change in the velocities of all bodies; `incidence` says which contacts each is a and b of."""
     (on_a, on_b), (of_a, of_b) = incidence, find_changes(contacts, impulses)
-    exact = lax.Precision.HIGHEST
-    return _map(lambda a, b: jnp.dot(on_a, a, precision=exact) + jnp.dot(on_b, b, precision=exact), of_a, of_b)
+    gather = lambda matrix, part: jnp.dot(matrix, part.reshape(-1, part.shape[-1]), precision=lax.Precision.HIGHEST)  # noqa: E731
+    return _map(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
 
 
 __all__ = [

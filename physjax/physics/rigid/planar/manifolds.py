@@ -4,10 +4,13 @@ Arrays are by components, `(pairs, worlds)`, those of corners `(corners, pairs, 
 memory is one and the same pair of many worlds. E. Catto (Box2D) describes the method.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
+
+from physjax.backend import materialise
 
 PARALLEL_SHARE = 1e-3
 """Share of a shape's size by which another face must be further out to be taken for the one that is touched."""
@@ -53,11 +56,13 @@ def find_manifolds(a: Outline, b: Outline) -> Manifold:
     """The points at which shapes touch."""
     from_a, from_b = _find_separation(a, b), _find_separation(b, a)
     tolerance = PARALLEL_SHARE * _measure_size(a)
-    on_a = jnp.max(from_a, axis=0) >= jnp.max(from_b, axis=0) - tolerance
+    # each stage is stored: every number of a manifold would compute all of it again
+    store = partial(materialise, a.radius.ravel()[0])
+    on_a = store(lambda: jnp.max(from_a, axis=0) >= jnp.max(from_b, axis=0) - tolerance)
     touched, other = _choose(on_a, a, b), _choose(on_a, b, a)
-    face = _pick_edge(touched, jnp.where(on_a, from_a, from_b))
-    facing = -(face.normal[0] * other.normals[0] + face.normal[1] * other.normals[1])
-    edge = _pick_edge(other, jnp.where(other.is_edge, facing, -jnp.inf))
+    face = store(lambda: _pick_edge(touched, jnp.where(on_a[None], from_a, from_b)))
+    facing = -(face.normal[0][None] * other.normals[0] + face.normal[1][None] * other.normals[1])
+    edge = store(lambda: _pick_edge(other, jnp.where(other.is_edge, facing, -jnp.inf)))
     return _orient(_touch_face(touched, other, face, edge), on_a)
 
 
@@ -80,12 +85,12 @@ def _measure_size(shape: Outline) -> Array:
 
 
 def _choose(flag: Array, a: Outline, b: Outline) -> Outline:
-    pick = lambda x, y: jnp.where(flag, x, y)  # noqa: E731
+    each = lambda x, y: jnp.where(flag[None], x, y)  # noqa: E731
     return Outline(
-        (pick(a.corners[0], b.corners[0]), pick(a.corners[1], b.corners[1])),
-        (pick(a.normals[0], b.normals[0]), pick(a.normals[1], b.normals[1])),
-        pick(a.is_edge, b.is_edge),
-        pick(a.radius, b.radius),
+        (each(a.corners[0], b.corners[0]), each(a.corners[1], b.corners[1])),
+        (each(a.normals[0], b.normals[0]), each(a.normals[1], b.normals[1])),
+        each(a.is_edge, b.is_edge),
+        jnp.where(flag, a.radius, b.radius),
     )
 
 
@@ -118,30 +123,35 @@ def _touch_face(touched: Outline, other: Outline, face: _Edge, edge: _Edge) -> M
     (low, low_height), (high, high_height) = (
         tuple(jnp.where(swap, b, a) for a, b in zip(*pair, strict=True)) for pair in (ends, ends[::-1])
     )
-    overlaps = (high >= 0) & (low <= length) & jnp.any(touched.is_edge, axis=0)
     width = high - low
     slope = (high_height - low_height) / jnp.where(width > SAME_POINT_SHARE * length, width, jnp.inf)
-    along = jnp.stack([jnp.clip(low, 0.0, length), jnp.clip(high, 0.0, length)])
-    heights = low_height + slope * (along - low)
-    # beyond an end of the face: that end and the nearer end of the edge
-    beyond = low > length
-    corner = jnp.where(beyond, length, 0.0)
-    reach, rise = jnp.where(beyond, low, high) - corner, jnp.where(beyond, low_height, high_height)
-    square = reach * reach + rise * rise
-    far = square > 0
+    along = [jnp.clip(end, 0.0, length) for end in (low, high)]
+    heights = [low_height + slope * (place - low) for place in along]
+    # the end of the edge that is nearest, and the end of the face that it is beyond, if it is
+    squares = [(x - jnp.clip(x, 0.0, length)) ** 2 + y * y for x, y in ((low, low_height), (high, high_height))]
+    first = squares[0] <= squares[1]
+    place, rise, square = (jnp.where(first, a, b) for a, b in ((low, high), (low_height, high_height), squares))
+    corner = jnp.clip(place, 0.0, length)
+    is_beyond = (place != corner) & (rise > 0) & (square < jnp.minimum(heights[0], heights[1]) ** 2)
+    overlaps = (high >= 0) & (low <= length) & jnp.any(touched.is_edge, axis=0) & ~is_beyond
+    reach, far = place - corner, square > 0
     distance = jnp.sqrt(jnp.where(far, square, 1.0))
     across, out = jnp.where(far, reach / distance, 0.0), jnp.where(far, rise / distance, 1.0)
     distance = jnp.where(far, distance, 0.0)
     # in the frame of the face: (along, out)
     normal_along, normal_out = jnp.where(overlaps, 0.0, across), jnp.where(overlaps, 1.0, out)
-    gaps = jnp.where(overlaps, heights, distance) - radii
-    base_along, base_out = jnp.where(overlaps, along, corner), jnp.zeros_like(along)
-    middle = touched.radius + gaps / 2
-    place_along, place_out = base_along + normal_along * middle, base_out + normal_out * middle
+    gaps = [jnp.where(overlaps, height, distance) - radii for height in heights]
+    places = [
+        (jnp.where(overlaps, end, corner) + normal_along * middle, normal_out * middle)
+        for end, middle in zip(along, (touched.radius + gap / 2 for gap in gaps), strict=True)
+    ]
     is_point = jnp.stack([jnp.ones_like(overlaps), overlaps & (along[1] - along[0] > SAME_POINT_SHARE * length)])
-    points = px - ny * place_along + nx * place_out, py + nx * place_along + ny * place_out
+    points = (
+        jnp.stack([px - ny * x + nx * y for x, y in places]),
+        jnp.stack([py + nx * x + ny * y for x, y in places]),
+    )
     normal = nx * normal_out - ny * normal_along, ny * normal_out + nx * normal_along
-    return Manifold(normal, points, gaps, is_point)
+    return Manifold(normal, points, jnp.stack(gaps), is_point)
 
 
 def _see_from(face: _Edge, point: Vector) -> Vector:
@@ -152,7 +162,7 @@ def _see_from(face: _Edge, point: Vector) -> Vector:
 
 def _orient(found: Manifold, on_a: Array) -> Manifold:
     """The manifold of a touched by b, whose points come in the other order where b was touched by a."""
-    turn = lambda array: jnp.where(on_a | ~found.is_point[1], array, array[::-1])  # noqa: E731
+    turn = lambda array: jnp.where((on_a | ~found.is_point[1])[None], array, array[::-1])  # noqa: E731
     sign = jnp.where(on_a, 1.0, -1.0).astype(found.gaps.dtype)
     return Manifold(
         (sign * found.normal[0], sign * found.normal[1]),

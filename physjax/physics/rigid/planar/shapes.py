@@ -45,7 +45,7 @@ class PlanarShape(eqx.Module):
         if size.shape != (2,):
             raise ValueError(f"size [m]: got the shape {size.shape}, expected two sides, (2,).")
         signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-        return cls(jnp.asarray(signs, size.dtype) * size, jnp.zeros((), size.dtype))
+        return cls(jnp.asarray(signs, size.dtype) * size[None], jnp.zeros((), size.dtype))
 
     @classmethod
     def polygon(cls, corners: NestedArrayLike, radius: float | Array = 0.0) -> "PlanarShape":

@@ -9,12 +9,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from physjax.checks import NestedArrayLike, OptionalNumbers, as_positive_integer, quantity, unchecked_quantity
+from physjax.checks import NestedArrayLike, Numbers, as_positive_integer, quantity, unchecked_quantity
 from physjax.parts import Contact
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.contacts.surface import Surface
 from physjax.physics.rigid.planar.bodies import PlanarBodies
-from physjax.physics.rigid.planar.pairs import list_pairs
+from physjax.physics.rigid.planar.pairs import group_contacts, list_pairs
 from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.planar.shapes import PlanarShape
 from physjax.physics.rigid.planar.surfaces import list_slots
@@ -29,14 +29,14 @@ class Solids(Contact):
     """Bodies in the plane that may not pass each other or the surfaces, with restitution K_r and Coulomb's friction.
 
     `shapes` is one for all bodies, or a sequence with one for each in the last lane axis; `surfaces` are those of `contacts`,
-    with a restitution and friction of their own. Between bodies both are the mean of the two, where `restitution` is given
-    for each; without one nothing bounces, on surfaces neither, and no impact is compiled.
-    `pairs`, `(pairs, 2)`, lists those that can touch: without, all pairs, of up to 64 bodies.
+    with a restitution and friction of their own. Between bodies it is the mean of the two where `restitution` is given for
+    each. `pairs`, `(pairs, 2)`, lists those that can touch: without, all pairs, of up to 64 bodies.
 
     Each step is taken in `substeps`. In each, what would reach another body bounces first, all hits that arrive together
     at once and until none approaches; then impulses keep every gap open and every contact from approaching, with those of
     the sub-step before as a start. Exact under uniform gravity where the method is. Overlap is cured softly: under a load F
-    a contact of bodies of mass m sinks by F/(m ω²), ω = π/2 a sub-step. First order in the sub-step where bodies collide.
+    a contact that moves a mass m sinks by F h²/(2π² m), h the sub-step. First order in h where bodies collide; what
+    approaches slower than twice what forces change in a sub-step does not bounce.
 
     Example:
         >>> crate, floor = inertia.planar_plate(2.0, (1.0, 1.0)), contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0)
@@ -56,14 +56,14 @@ class Solids(Contact):
     coulomb: Coulomb | None
     pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
-    restitution: OptionalNumbers = quantity("restitution K_r", "1", per=None, at_least=0, at_most=1, default=None)
+    restitution: Numbers = quantity("restitution K_r", "1", per=None, at_least=0, at_most=1, default=0.0)
     impulses: Array | None = unchecked_quantity("impulses", "N s", per="memory", default=None)
 
     def __init__(
         self,
         shapes: PlanarShape | Sequence[PlanarShape],
         surfaces: Sequence[Surface] = (),
-        restitution: ArrayLike | None = None,
+        restitution: ArrayLike = 0.0,
         coulomb: Coulomb | None = None,
         *,
         pairs: NestedArrayLike | None = None,
@@ -119,7 +119,7 @@ class Solids(Contact):
             raise ValueError(
                 f"Solids: got {len(self.shapes)} shapes for {state.lanes[-1]} bodies, expected one for all or one for each."
             )
-        if self.restitution is not None and self.restitution.shape not in ((), state.lanes[-1:]):
+        if self.restitution.shape not in ((), state.lanes[-1:]):
             raise ValueError(
                 f"Solids: got restitution of shape {self.restitution.shape}, expected () or {state.lanes[-1:]}."
             )
@@ -128,8 +128,8 @@ class Solids(Contact):
         """The contact with its pairs listed and no impulses yet."""
         bodies = state.lanes[-1]
         pairs = list_pairs(self.pairs, bodies)
-        contacts = len(pairs) + bodies * len(list_slots(self.surfaces))
-        none = jnp.zeros((*state.lanes[:-1], 3, contacts), state.dtype)
+        groups = group_contacts(pairs, len(list_slots(self.surfaces)), bodies)
+        none = jnp.zeros((*state.lanes[:-1], 3, *groups.contact.shape), state.dtype)
         parts = self.shapes, self.surfaces, self.restitution, self.coulomb
         listed = Solids(*parts, pairs=pairs, substeps=self.substeps)
         return eqx.tree_at(lambda solids: solids.impulses, listed, none, is_leaf=lambda leaf: leaf is None)

@@ -55,19 +55,20 @@ def _find_points(surface: Surface, t: ArrayLike, shapes: Outline) -> Manifold:
         x, y = jnp.concatenate([x, on_x]), jnp.concatenate([y, on_y])
     distance = _measure(surface, t, (x, y))
     first = jnp.argmin(distance, axis=0)
-    same = (x == _take(x, first)) & (y == _take(y, first))  # padding repeats corners
+    same = (x == _take(x, first)[None]) & (y == _take(y, first)[None])  # padding repeats corners
     second = jnp.argmin(jnp.where(same, jnp.inf, distance), axis=0)
     several = ~jnp.all(same, axis=0)
     pick = lambda rows: jnp.stack([_take(rows, first), _take(rows, second)])  # noqa: E731
     place = pick(x), pick(y)
     normal = surface.normal_at(t, jnp.stack(place, axis=-1))
     nx, ny = -normal[..., 0], -normal[..., 1]
-    gap = pick(distance) - shapes.radius
-    reach = shapes.radius + gap / 2
+    radius = shapes.radius[None]
+    gap = pick(distance) - radius
+    reach = radius + gap / 2
     points = place[0] + nx * reach, place[1] + ny * reach
     # in order along the first normal turned left
     ahead = (place[1][1] - place[1][0]) * nx[0] - (place[0][1] - place[0][0]) * ny[0] < 0
-    turn = lambda array: jnp.where(ahead & several, array[::-1], array)  # noqa: E731
+    turn = lambda array: jnp.where((ahead & several)[None], array[::-1], array)  # noqa: E731
     is_point = jnp.stack([jnp.ones_like(several), several])
     return Manifold((turn(nx), turn(ny)), (turn(points[0]), turn(points[1])), turn(gap), is_point)
 
@@ -106,7 +107,7 @@ def _follow(shapes: Outline) -> Vector:
     """The corner after each, of the last one the first; of what is no edge, the corner itself."""
     last = jnp.sum(shapes.is_edge, axis=0) - 1
     numbers = jnp.arange(len(shapes.corners[0])).reshape(-1, 1, 1)
-    follow = lambda c: jnp.where(numbers == last, c[:1], jnp.concatenate([c[1:], c[-1:]]))  # noqa: E731
+    follow = lambda c: jnp.where(numbers == last[None], c[:1], jnp.concatenate([c[1:], c[-1:]]))  # noqa: E731
     x, y = shapes.corners
     return jnp.where(shapes.is_edge, follow(x), x), jnp.where(shapes.is_edge, follow(y), y)
 

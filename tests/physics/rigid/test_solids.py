@@ -1,0 +1,198 @@
+"""Bodies that touch in the plane, against momentum, friction's closed forms, and what stacks do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physjax import Scene, contacts, forces, inertia, methods, rigid, simulate
+
+CRATE = inertia.planar_plate(1.0, (1.0, 1.0))
+SQUARE = rigid.PlanarShape.box((1.0, 1.0))
+BALL = inertia.planar_disc(1.0, 0.5)
+DISC = rigid.PlanarShape.disc(0.5)
+
+
+def rough(friction):
+    return contacts.Coulomb(friction, friction)
+
+
+def floor(friction=0.5, restitution=0.0):
+    return contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=restitution, coulomb=rough(friction))
+
+
+def stack(worlds, count=10, substeps=8, dtype=float, seed=0):
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-0.02, 0.02, (*worlds, count)), np.broadcast_to(np.arange(count) + 0.5, (*worlds, count))
+    pairs = [(i, i + 1) for i in range(count - 1)]
+    solids = rigid.Solids(SQUARE, (floor(),), coulomb=rough(0.5), pairs=pairs, substeps=substeps)
+    pile = rigid.planar_bodies(CRATE, np.stack([x, y], axis=-1).astype(dtype))
+    return Scene(pile, CRATE, (forces.Gravity(),), contacts=(solids,))
+
+
+# impacts
+
+
+def cradle(speeds, coming=None, count=5):
+    """Five balls in a row, of which the first of each world come in with these speeds, `(worlds, balls)`."""
+    coming = np.asarray(speeds) > 0 if coming is None else coming
+    x = np.arange(count, dtype=float) - 0.3 * coming
+    velocity = jnp.stack([speeds, jnp.zeros_like(speeds)], axis=-1)
+    row = rigid.planar_bodies(BALL, np.stack([x, 0 * x], axis=-1), velocity=velocity)
+    return Scene(
+        row, BALL, contacts=(rigid.Solids(DISC, restitution=1.0, pairs=[(i, i + 1) for i in range(count - 1)]),)
+    )
+
+
+def test_as_many_balls_leave_a_cradle_as_come_in():
+    coming = jnp.asarray([[1.0] * k + [0.0] * (5 - k) for k in (1, 2, 3)])
+    end = simulate(cradle(coming), methods.verlet, dt=1 / 60, steps=40).state.momentum[-1]
+    np.testing.assert_allclose(end[..., 0], coming[:, ::-1], atol=1e-12)
+    assert np.abs(end[..., 1]).max() == 0
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_the_last_ball_of_a_cradle_leaves_with_the_speed_of_the_first(mode):
+    def leave(speed):
+        coming = jnp.zeros((1, 5)).at[0, 0].set(speed)
+        return simulate(cradle(coming, np.eye(1, 5)), methods.verlet, dt=1 / 30, steps=15).state.momentum[-1, 0, -1, 0]
+
+    differentiate = jax.jacfwd if mode == "forward" else jax.grad
+    assert differentiate(leave)(1.0) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_break_keeps_energy_momentum_and_mirror_symmetry():
+    places = [(i * np.sqrt(3) / 2, j - i / 2) for i in range(5) for j in range(i + 1)] + [(-3.0, 0.0)]
+    velocity = np.zeros((16, 2))
+    velocity[-1, 0] = 10.0
+    rack = rigid.planar_bodies(BALL, places, velocity=velocity)
+    scene = Scene(rack, BALL, contacts=(rigid.Solids(DISC, restitution=1.0),))
+    end = simulate(scene, methods.verlet, dt=1 / 60, steps=60).state
+    p, x = np.asarray(end.momentum[-1]), np.asarray(end.position[-1])
+    assert (p**2).sum() == pytest.approx(100.0, rel=1e-9)
+    np.testing.assert_allclose(p.sum(axis=0), [10.0, 0.0], atol=1e-12)
+    mirrored = x * [1, -1]
+    assert max(np.abs(mirrored - other).max(axis=1).min() for other in x) < 1e-10
+
+
+def test_an_elastic_ball_keeps_its_energy_and_an_inelastic_one_stays():
+    solids = rigid.Solids(DISC, (floor(0.0, restitution=1.0),), restitution=1.0)
+    ball = rigid.planar_bodies(BALL, [[0.0, 1.5]])
+    state = simulate(
+        Scene(ball, BALL, (forces.Gravity(),), contacts=(solids,)), methods.verlet, dt=1 / 60, steps=200
+    ).state
+    energy = 9.8 * (state.position[:, 0, 1] - 0.5) + state.momentum[:, 0, 1] ** 2 / 2
+    # what approaches slower than forces change in two sub-steps stays; nothing else is lost
+    np.testing.assert_allclose(energy, 9.8, rtol=2e-3)
+    assert float(state.position[:, 0, 1].min()) > 0.5 - 1e-3
+
+
+# friction
+
+
+def test_a_push_moves_what_friction_does_not_hold():
+    push, friction = np.array([0.0, 0.2, 0.49, 0.51, 0.7, 2.0]) * 9.8, 0.5
+    scene = Scene(
+        rigid.planar_bodies(CRATE, np.tile([0.0, 0.5], (6, 1, 1))),
+        CRATE,
+        (forces.Gravity(), forces.Constant(np.stack([push, 0 * push], axis=-1)[:, None])),
+        contacts=(rigid.Solids(SQUARE, (floor(friction),)),),
+    )
+    speed = simulate(scene, methods.verlet, dt=1 / 60, steps=120).state.momentum[..., 0, 0]
+    gained = np.asarray(speed[-1] - speed[60])
+    np.testing.assert_allclose(gained, np.maximum(push - friction * 9.8, 0.0), rtol=5e-3, atol=1e-3)
+    assert np.abs(gained[:3]).max() < 1e-12
+
+
+def test_a_box_on_a_slope_rests_below_the_angle_of_friction_and_slides_above():
+    friction, above = 0.5, np.deg2rad(0.05)
+    for angle, slides in ((np.arctan(friction) - above, False), (np.arctan(friction) + above, True)):
+        along, out = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        slope = contacts.Plane((0.0, 0.0), out, restitution=0.0, coulomb=rough(friction))
+        box = rigid.planar_bodies(CRATE, [0.5 * out], angle=[angle])
+        scene = Scene(box, CRATE, (forces.Gravity(),), contacts=(rigid.Solids(SQUARE, (slope,)),))
+        speed = -np.asarray(simulate(scene, methods.verlet, dt=1 / 60, steps=120).state.momentum[:, 0]) @ along
+        expected = 9.8 * (np.sin(angle) - friction * np.cos(angle)) if slides else 0.0
+        assert speed[-1] - speed[60] == pytest.approx(expected, abs=1e-3 if slides else 1e-12)
+
+
+def test_a_box_that_slides_stops_after_its_distance():
+    box = rigid.planar_bodies(CRATE, [[0.0, 0.5]], velocity=[[6.0, 0.0]])
+    scene = Scene(box, CRATE, (forces.Gravity(),), contacts=(rigid.Solids(SQUARE, (floor(0.3),)),))
+    end = simulate(scene, methods.verlet, dt=1 / 60, steps=180).state
+    assert end.position[-1, 0, 0] == pytest.approx(36 / (2 * 0.3 * 9.8), rel=5e-3)
+    assert np.abs(end.momentum[-1]).max() < 1e-9
+
+
+# rest
+
+
+def test_a_stack_of_ten_boxes_stands():
+    run = simulate(stack((3,)), methods.verlet, dt=1 / 60, steps=600, save_every=60)
+    x = np.asarray(run.state.position)
+    assert np.abs(x[1:, ..., 0] - x[1, ..., 0]).max() < 1e-3
+    assert np.abs(x[-1, ..., 1] - np.arange(10) - 0.5).max() < 1e-3
+    assert np.abs(run.state.momentum[-1]).max() < 1e-3
+
+
+def test_a_light_box_carries_a_hundredfold_one():
+    masses = inertia.planar_plate(np.array([1.0, 100.0]), np.ones((2, 2)))
+    pile = rigid.planar_bodies(masses, [[0.0, 0.5], [0.0, 1.5]])
+    scene = Scene(pile, masses, (forces.Gravity(),), contacts=(rigid.Solids(SQUARE, (floor(),)),))
+    end = simulate(scene, methods.verlet, dt=1 / 60, steps=300, save_every=300).state
+    assert np.abs(end.position[-1, :, 1] - np.array([0.5, 1.5])).max() < 5e-3
+    assert np.abs(end.momentum[-1]).max() < 1e-2
+
+
+def test_a_world_in_a_batch_is_the_world_alone():
+    many = simulate(stack((4,), count=4), methods.verlet, dt=1 / 60, steps=10).state
+    for world in range(4):
+        x = many.position[0, world]
+        alone = stack((), count=4)
+        alone = alone.replace(state=alone.state._replace(position=x))
+        one = simulate(alone, methods.verlet, dt=1 / 60, steps=10).state
+        np.testing.assert_allclose(one.position, many.position[:, world], rtol=1e-12, atol=1e-13)
+
+
+def test_random_drops_gain_no_energy_and_stay_out_of_each_other():
+    rng = np.random.default_rng(11)
+    worlds = 64
+    shapes = [
+        DISC,
+        rigid.PlanarShape.capsule(0.2, 0.6),
+        SQUARE,
+        rigid.PlanarShape.polygon([[-0.5, -0.3], [0.5, -0.3], [0.0, 0.6]]),
+    ]
+    bodies = len(shapes)
+    x = np.stack(
+        [rng.uniform(-0.5, 0.5, (worlds, bodies)), 1 + 1.6 * np.arange(bodies) + rng.uniform(0, 0.2, (worlds, bodies))],
+        -1,
+    )
+    angle, velocity = rng.uniform(-3, 3, (worlds, bodies)), rng.uniform(-1, 1, (worlds, bodies, 2))
+    thrown = rigid.planar_bodies(CRATE, x, angle, velocity, rng.uniform(-3, 3, (worlds, bodies)))
+    solids = rigid.Solids(shapes, (floor(0.5, restitution=0.3),), restitution=0.3, coulomb=rough(0.5))
+    state = simulate(
+        Scene(thrown, CRATE, (forces.Gravity(),), contacts=(solids,)), methods.verlet, dt=1 / 60, steps=150
+    ).state
+    energy = np.sum(state.kinetic_energy(CRATE) + 9.8 * state.position[..., 1], axis=-1)
+    assert np.isfinite(energy).all()
+    assert (energy / energy[:1]).max() < 1.001
+    assert float(state.position[..., 1].min()) > 0.15
+
+
+# refusals
+
+
+def test_what_does_not_fit_is_refused_in_plain_words():
+    pile = rigid.planar_bodies(CRATE, [[0.0, 0.5], [0.0, 1.5]])
+    with pytest.raises(ValueError, match="3 shapes for 2 bodies"):
+        Scene(pile, CRATE, contacts=(rigid.Solids([SQUARE] * 3),))
+    with pytest.raises(ValueError, match="pairs"):
+        Scene(pile, CRATE, contacts=(rigid.Solids(SQUARE, pairs=[(0, 2)]),))
+    with pytest.raises(TypeError, match="PlanarBodies"):
+        Scene(rigid.bodies(inertia.sphere(1.0, 1.0)), inertia.sphere(1.0, 1.0), contacts=(rigid.Solids(SQUARE),))
+    with pytest.raises(TypeError, match="PlanarShape"):
+        rigid.Solids([(1.0, 1.0)])
+    many = rigid.planar_bodies(CRATE, np.zeros((65, 2)))
+    with pytest.raises(ValueError, match="at most 64"):
+        Scene(many, CRATE, contacts=(rigid.Solids(SQUARE),))
