@@ -83,15 +83,10 @@ FORWARD = {
 }
 """Operations of eight rk4 steps."""
 GRADIENT = {
-    "plane": 2920,
-    "room of 6": 4290,
-    "room of 60": 4415,
     "planes and spheres": 6595,
     "fall_with_drag": 403,
     "flag": 8519,
     "bouncing_ball": 2486,
-    "tumbling_box": 10263,
-    "ragdoll": 20082,
     "car": 20079,
 }
 """Operations of a value and its gradient by velocities."""

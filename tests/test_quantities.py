@@ -256,7 +256,6 @@ def tables(kind, entries):
         (MIN_LANES_TO_CUT, "declared"),
         (MIN_LANES_TO_CUT, "not declared"),
         pytest.param(1024, "Control", marks=pytest.mark.slow),
-        pytest.param(1024, "declared", marks=pytest.mark.slow),
         pytest.param(1024, "not declared", marks=pytest.mark.slow),
     ],
 )

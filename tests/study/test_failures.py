@@ -1,5 +1,7 @@
 """It must fail here, and here is the figure: each failure happens, and is explained by its right cause."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,10 +14,16 @@ from physjax.study.energy.quantities import total
 SLOW = {"stiff_cloth", "damped_cloth", "implicit_midpoint_on_a_swinging_rope", "tr_bdf2_linearised_once"}
 
 
+@functools.cache
+def explain(name):
+    """A failure and its explanation."""
+    run = FAILURES[name]()
+    return run, stability.explain(run.scene, run.method, run.dt, steps=run.steps)
+
+
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in FAILURES])
 def test_the_right_cause_is_named(name):
-    run = FAILURES[name]()
-    found = stability.explain(run.scene, run.method, run.dt, steps=run.steps)
+    run, found = explain(name)
     assert (found.cause, found.force) == (run.cause, run.force)
     assert len(found.cures) == 2
     if run.limit is not None:
@@ -56,8 +64,7 @@ def test_rk4_loses_energy_below_its_limit():
 
 
 def test_a_cloth_is_explained_with_its_spring_and_its_node():
-    run = FAILURES["damped_cloth"]()
-    found = stability.explain(run.scene, run.method, run.dt)
+    run, found = explain("damped_cloth")
     assert found.limit == pytest.approx(float(stability.measure_limit(run.scene, run.method)), rel=0.02)
     assert found.first_bad_step > 0
     assert f"{found.cause} of Springs (the spring between nodes" in str(found)
@@ -69,8 +76,7 @@ def test_drag_turns_a_fast_body_around_within_a_step():
 
 
 def test_a_close_approach_is_cured_by_short_steps_there():
-    run = FAILURES["close_approach"]()
-    assert "adaptive" in stability.explain(run.scene, run.method, run.dt).cures[1]
+    assert "adaptive" in explain("close_approach")[1].cures[1]
 
 
 def test_a_ball_in_float32_stands_still_far_from_the_origin():

@@ -61,7 +61,7 @@ def test_no_impulses_at_any_points_add_energy():
 @pytest.mark.slow
 def test_hundreds_of_random_drops_never_gain_energy():
     rng = np.random.default_rng(1)
-    n = 400
+    n = 200
     size = rng.uniform(0.1, 0.6, (n, 3))
     body = inertia.box(jnp.ones(n), jnp.asarray(size))
     place = np.zeros((n, 3))
@@ -101,7 +101,7 @@ def test_a_smooth_box_keeps_its_energy_over_a_hundred_impacts():
 @pytest.mark.slow
 def test_a_box_dropped_tilted_comes_to_rest_on_a_face_and_then_does_not_move():
     scene = dropped(floor(0.0, 0.5))
-    film = simulate(scene, methods.rk4, dt=1e-3, steps=104_000, save_every=4000)
+    film = simulate(scene, methods.rk4, dt=1e-3, steps=36_000, save_every=4000)
     rest, turns = np.asarray(film.position)[1:], np.asarray(film.state.orientation)[1:]
     assert np.abs(float(rest[0, 1]) - np.asarray(SIZE) / 2).min() < 1e-6
     assert np.abs(rest - rest[0]).max() <= 1e-9
@@ -143,8 +143,7 @@ def test_a_belt_takes_a_ball_along():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
-def test_gradients_through_an_impact_agree_with_differences(derivative):
+def test_gradients_through_an_impact_agree_with_differences():
     @jax.jit
     def outcome(numbers):
         surface = floor(numbers[0], numbers[1])
@@ -157,7 +156,8 @@ def test_gradients_through_an_impact_agree_with_differences(derivative):
     at, h = jnp.asarray([0.5, 0.3, 1.0, 2.0, 3.0, 1.0]), 1e-6
     differences = [(outcome(at + h * e) - outcome(at - h * e)) / (2 * h) for e in jnp.eye(6)]
     assert abs(differences[0]) > 1e-2  # there is an impact
-    np.testing.assert_allclose(jax.jit(derivative(outcome))(at), differences, rtol=1e-5, atol=1e-7)
+    for derivative in (jax.jacfwd, jax.grad):
+        np.testing.assert_allclose(jax.jit(derivative(outcome))(at), differences, rtol=1e-5, atol=1e-7)
 
 
 # bad input

@@ -54,8 +54,7 @@ def test_forces_and_energies_are_the_same(layout, twice, monkeypatch):
     compare_as_if_for_a_gpu(monkeypatch, twice, compute, state, turned)
 
 
-@LAYOUTS
-@TWICE
+@pytest.mark.parametrize(("layout", "twice"), [("bands", True), ("gather", False)])
 def test_derivatives_are_the_same(layout, twice, monkeypatch):
     _, springs, state = build_sheet(layout, each=True)
     arrays, static = eqx.partition(springs, eqx.is_inexact_array)
@@ -93,7 +92,7 @@ def test_a_run_with_wind_and_a_moving_edge_is_the_same(layout, monkeypatch):
 
     def run(speed):
         moved = scene.replace(state=scene.state._replace(velocity=speed * scene.state.velocity))
-        end = simulate(moved, methods.midpoint, dt=1e-3, steps=2, save_every=2).final_scene
+        end = simulate(moved, methods.semi_implicit_euler, dt=1e-3, steps=2, save_every=2).final_scene
         return jnp.sum(end.state.position**2), (end.state, end.forces[1].unbroken)
 
     compute = jax.value_and_grad(run, has_aux=True)

@@ -106,7 +106,7 @@ def test_the_third_dimension_goes_where_nothing_needs_it():
     spin = forces.Magnus(4.3e-3, 3.0, (0.0, 0.0, 3.0))
     floor = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.7, friction=0.2, response=contacts.project)
     parts = (forces.Gravity(), forces.QuadraticDrag(4.3e-3, 0.4, wind=(-2.0, 0.0, 0.0)), spin)
-    run = {"method": methods.rk4, "dt": 0.01, "duration": 1.5, "save_every": 50, **UNTIMED}
+    run = {"method": methods.midpoint, "dt": 0.01, "duration": 1.5, "save_every": 50, **UNTIMED}
     told = accuracy.ablate(Scene(ball, 0.145, parts, (floor,)), lambda f: f.position[-1], **run)
     assert told["third dimension"].change.max() < 1e-12
     assert told["third dimension"].verdict == NONE
@@ -133,7 +133,7 @@ def test_what_is_born_stays_born_when_something_else_is_left_out():
     )
     fountain = Scene(jet.unborn(), 1e-3, (forces.Gravity(), forces.QuadraticDrag(1e-4, 0.4)), emitter=jet)
     told = accuracy.ablate(
-        fountain, lambda film: film.position[-1, :, 1].max(), method=methods.rk4, dt=0.01, duration=1.0, **UNTIMED
+        fountain, lambda film: film.position[-1, :, 1].max(), method=methods.midpoint, dt=0.01, duration=1.0, **UNTIMED
     )
     # without gravity the first to be born flies at its speed, but for the drag
     assert 3.0 < told["Gravity"].outcome < 6.0

@@ -255,6 +255,7 @@ def test_a_miss_has_zero_derivatives_and_spoils_no_neighbour():
     np.testing.assert_allclose(found, jnp.stack([alone, jnp.zeros(2)]), atol=1e-12)
 
 
+@pytest.mark.parametrize("precision", ["float64"], indirect=True)
 def test_vmap_is_the_same_as_lanes(precision):
     targets = jnp.array([[20.0, 3.0], [25.0, -4.0], [70.0, 0.0]], precision.dtype)
     scene = ball(position=jnp.zeros(2, precision.dtype))
@@ -329,6 +330,7 @@ def test_the_descent_to_a_hit_ends_at_rounding(precision):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float32"], indirect=True)  # whose rounding is seen
 def test_far_from_the_origin_a_hit_is_a_hit(precision):
     """Places are rounded by where they are, at every step; what that leaves of a miss is no miss."""
     targets, speed = (jnp.asarray(part, precision.dtype) for part in reachable(256, RNG.uniform(0.5, 0.9, 256)))

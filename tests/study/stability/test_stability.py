@@ -58,7 +58,8 @@ def test_the_lectures_oscillator_has_its_known_limits(method):
     predicted = stability.limit(oscillator(b=0.1), method)
     assert predicted.dt == pytest.approx(known.get(method.__name__, predicted.dt), rel=1e-4)
     assert (predicted.cause, predicted.force) == ("stiffness", "Anchor")
-    measured = stability.measure_limit(oscillator(b=0.1), method, steps=300_000 if method is methods.euler else 20_000)
+    steps = 300_000 if method is methods.euler else 20_000 if method in BOUNDED.values() else 2000
+    measured = stability.measure_limit(oscillator(b=0.1), method, steps=steps)
     assert measured == pytest.approx(predicted.dt, rel=0.02)
 
 
@@ -67,34 +68,41 @@ def test_the_lectures_oscillator_has_its_known_limits(method):
 def test_the_limit_of_an_oscillator_is_the_measured_one(method, b):
     if b is None and not method.promises.stability_limit:
         pytest.skip("never stable: see the test of its growth")
+    if (b == 3.0 and method is not methods.rk4) or (b and method not in BOUNDED.values()):
+        pytest.skip("as the lecture's, which is damped as well, and of which all are tried")
     predicted = stability.limit(oscillator(b=b), method)
     assert stability.measure_limit(oscillator(b=b), method) == pytest.approx(predicted.dt, rel=0.02)
     assert predicted.cause == ("damping" if b == 20.0 else "stiffness")
 
 
-@ALL
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, id=name) for name, m in BOUNDED.items() if m.promises.stability_limit]
+)
 def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
     chain = SCENES["oscillator_chain"]().scene
     predicted = stability.limit(chain, method)
     omega = 2 * np.sqrt(400.0) * np.sin(50 * np.pi / 102)
     assert predicted.dt == pytest.approx(method.promises.stability_limit / omega, rel=1e-6)
-    if 0 < predicted.dt < np.inf:
-        # near its limit tsit5 grows so slowly that how long a run lasts decides whether it shows
-        steps, within = (6000, 0.3) if method is METHODS["tsit5"] else (2000, 0.02)
-        assert confirmed(chain, method, steps, within)[1:] == (True, True)
-        assert predicted.spring in [(i, i + 1) for i in range(20, 32)]
+    # near its limit tsit5 grows so slowly that how long a run lasts decides whether it shows
+    steps, within = (6000, 0.3) if method is METHODS["tsit5"] else (2000, 0.02)
+    assert confirmed(chain, method, steps, within)[1:] == (True, True)
+    assert predicted.spring in [(i, i + 1) for i in range(20, 32)]
 
 
 @pytest.mark.parametrize(
     ("count", "damped"), [(8, True), *(pytest.param(200, damped, marks=pytest.mark.slow) for damped in (False, True))]
 )
 def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
-    scene = networks(count, damped, *((5, 2) if count == 8 else (8, 2)))
+    many = networks(count, damped, *((5, 2) if count == 8 else (8, 2)))
+    few = networks(min(count, 30), damped, *((5, 2) if count == 8 else (8, 2)))
     for name, method in BOUNDED.items():
         if name == "tsit5":  # near its limit it grows so slowly that how long a run lasts decides whether it shows
             continue
         if count == 8 and name not in {"euler" if damped else "verlet", "semi_implicit_euler"}:
             continue
+        if name == "dopri8" and not damped:  # the chain of fifty is such a network
+            continue
+        scene = many if method.promises.evaluations <= 2 else few
         if not damped and not method.promises.stability_limit:
             assert not stability.limit(scene, method).each.any()
             continue
@@ -108,24 +116,16 @@ def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["semi_implicit_euler", "rk4"])
-@pytest.mark.parametrize("damping", [None, 10.0], ids=["undamped", "damped"])
+@pytest.mark.parametrize(
+    ("damping", "name"), [(None, "semi_implicit_euler"), (None, "rk4"), (10.0, "semi_implicit_euler")]
+)
 def test_the_limit_of_a_cloth_of_a_thousand_nodes_is_the_measured_one(name, damping):
     within = 0.02 if damping is None else 0.05
     predicted, below, above = confirmed(sheet(32, damping), METHODS[name], 200, within)
     assert (below, above) == (True, True)
     known = {(None, "semi_implicit_euler"): 6.3e-3, (10.0, "semi_implicit_euler"): 1.8e-3}
     assert predicted.dt == pytest.approx(known.get((damping, name), predicted.dt), rel=0.02)
-
-
-@pytest.mark.parametrize("damping", [pytest.param(None, marks=pytest.mark.slow), 10.0], ids=["undamped", "damped"])
-def test_what_sets_the_limit_of_a_cloth_is_its_stiffness_or_its_damping(damping):
-    cloth = sheet(12, damping)  # of this many coordinates only the fastest modes are sought
-    predicted = stability.limit(cloth, methods.semi_implicit_euler)
-    assert predicted.dt == pytest.approx(6.3e-3 if damping is None else 1.8e-3, rel=0.05)
     assert (predicted.cause, predicted.force) == ("stiffness" if damping is None else "damping", "Springs")
-    if damping:
-        assert confirmed(cloth, methods.semi_implicit_euler, 200, within=0.05)[1:] == (True, True)
 
 
 @pytest.mark.parametrize("name", ["euler", "midpoint"])
