@@ -92,6 +92,12 @@ def test_a_load_is_refused_on_particles_and_in_the_wrong_number_of_dimensions():
         Scene(FLAT_BODIES, PLATE, (rigid.Torque((0.0, 0.0, 1.0)),))
 
 
+def test_joints_are_for_bodies_in_space():
+    joint = rigid.Joints([(0, 1)], [[[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]], stiffness=1e3)
+    with pytest.raises(TypeError, match="Joints: got a state of type PlanarBodies, expected RigidBodies"):
+        loads(Scene(FLAT_BODIES, PLATE, (joint,)), 0.0)
+
+
 @pytest.mark.parametrize("coupled", [False, True])
 def test_the_angular_momentum_has_the_bodies_own(coupled):
     pull = (rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(bodies.momentum), couples=True),) * coupled
