@@ -350,8 +350,11 @@ def _prescribe(scene: Scene, start: PyTree, t: Time) -> Scene:
     """Kinematic nodes where their path is at the time t, held ones where they were at the start of the step."""
     if scene.prescribed_motion is not None:
         return scene.replace(state=scene.prescribed_motion.prescribe(to_float_time(t), scene.state))
-    held = jnp.asarray(scene.held)[..., None]
-    return scene.replace(state=jax.tree.map(lambda now, before: jnp.where(held, before, now), scene.state, start))
+    held = jnp.asarray(scene.held)
+    # an angle in the plane is a number for each lane, without an axis of components
+    like = lambda leaf: held if leaf.ndim == held.ndim else held[..., None]  # noqa: E731
+    keep = lambda now, before: jnp.where(like(now), before, now)  # noqa: E731
+    return scene.replace(state=jax.tree.map(keep, scene.state, start))
 
 
 def _advance_force(index: int, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:

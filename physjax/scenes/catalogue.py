@@ -13,6 +13,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
 
+from physjax.physics.rigid.planar import PlanarBodies
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.physics.springs.springs import Springs
 from physjax.scenes.registry import SCENES, title
@@ -130,7 +131,7 @@ def _describe_size(problem: Problem) -> str:
 
     state, forces = problem.scene.state, problem.scene.forces
     lanes = state.position[..., 0].size
-    one, many = ("body", "bodies") if isinstance(state, RigidBodies) else ("particle", "particles")
+    one, many = ("body", "bodies") if isinstance(state, RigidBodies | PlanarBodies) else ("particle", "particles")
     words = f"{lanes} {one if lanes == 1 else many}"
     springs = sum(len(force.pairs) for force in forces if isinstance(force, Springs))
     joined = f", {springs} spring{'s' * (springs > 1)}" if springs else ""

@@ -18,7 +18,7 @@ from physjax.show.films import Film, schedule
 from physjax.show.frames import get_faces, take_frames, take_lanes
 from physjax.show.panels import build_scenery
 from physjax.show.particles import prepare_particles
-from physjax.show.solids import Shape, take_bodies
+from physjax.show.solids import BodyShapes, prepare_bodies
 from physjax.show.spring_lines import build_spring_lines, draw_springs, draw_strain_bar, take_springs
 from physjax.show.surfaces import draw_surface
 from physjax.show.trails import build_trail_scenery, build_trails
@@ -59,13 +59,13 @@ def cloth(
 
 def bodies(
     film: Trajectory,
-    shapes: Shape | Sequence[Shape],
+    shapes: BodyShapes | None = None,
     *,
-    color: "ColorType" = "#56B4E9",
+    color: "ColorType | ArrayLike | None" = None,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
-    """Rigid bodies as solids; see `plot.bodies`, and `animate.cloth` for the errors.
+    """Rigid bodies in the plane or in space, as their shapes; see `plot.bodies`, and `animate.cloth` for the errors.
 
     Example:
         >>> from physjax.show import solids
@@ -74,9 +74,9 @@ def bodies(
         11
     """
     who = "animate.bodies"
-    seen, faces = take_bodies(who, film, shapes)
+    seen, draw = prepare_bodies(who, film, shapes, color)
     frames, fps = schedule(who, seen, fps, speed)
-    return Film(build_scenery(seen, frames), frames, fps, partial(draw_surface, faces=faces, color=color, closed=True))
+    return Film(build_scenery(seen, frames), frames, fps, draw)
 
 
 def springs(

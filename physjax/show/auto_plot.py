@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from physjax.physics.rigid.planar import PlanarBodies
 from physjax.show import animate, plot
-from physjax.show.drawables import Bodies, Dots, Lines, Look, Surface, choose_drawable, find_default_look
+from physjax.show.drawables import Bodies, Dots, Lines, Look, PlanarFigures, Surface, choose_drawable, find_default_look
 from physjax.show.films import Film
 from physjax.show.frames import take_lanes
 from physjax.show.panels import arrange_panels, build_scenery
@@ -26,6 +27,7 @@ _DRAWERS = {
     Surface: (plot.cloth, animate.cloth),
     Lines: (plot.springs, animate.springs),
     Bodies: (plot.bodies, animate.bodies),
+    PlanarFigures: (plot.bodies, animate.bodies),
 }
 
 
@@ -49,6 +51,8 @@ def animate_run(film: Trajectory, looks: Look | None = None) -> Film:
     if _has_emitter(film):
         return animate.particles(film, fps=FPS, speed=speed)
     kind, looks = _choose_drawable(film, looks)
+    if kind is Dots and isinstance(film.state, PlanarBodies):
+        return animate.bodies(film, fps=FPS, speed=speed)
     if kind is Dots:
         return animate.paths(film, every=_lane_stride(film), trail=TRAIL_SECONDS, fps=FPS, speed=speed)
     return _DRAWERS[kind][1](film, looks, fps=FPS, speed=speed)

@@ -1,15 +1,17 @@
 """What a run is drawn as: a surface, springs, bodies or dots, as the user says, or else as the scene is."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
+from physjax.physics.rigid.planar import PlanarBodies, PlanarShape
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.physics.springs.assembly import Lattice
 from physjax.physics.springs.springs import Springs
 from physjax.show.frames import Frames, get_faces, get_springs, take_frames, take_lanes
-from physjax.show.solids import Shape, build_inertia_box, check_shapes, place_shapes
+from physjax.show.planar import build_planar_outline, check_planar_bodies, find_planar_shapes, list_shapes
+from physjax.show.solids import BodyShapes, Shape, build_inertia_boxes, check_shapes, place_shapes
 from physjax.trajectory import Trajectory
 
 
@@ -39,14 +41,29 @@ class Bodies(NamedTuple):
         return Surface(*place_shapes(self.run, self.orientation, self.shapes))
 
 
+class PlanarFigures(NamedTuple):
+    """Centres of mass in the plane, angles `(frames, bodies)` [rad], and a shape for each body."""
+
+    run: Frames
+    angle: np.ndarray
+    shapes: list[PlanarShape]
+
+    def solids(self) -> Bodies:
+        """The bodies as flat solids in space, in the plane z = 0, turned about z."""
+        half, still = self.angle / 2, np.zeros_like(self.angle)
+        place = np.pad(self.run.position, [(0, 0), (0, 0), (0, 1)])
+        quaternions = np.stack([np.cos(half), still, still, np.sin(half)], axis=-1)
+        return Bodies(self.run._replace(position=place), quaternions, [_build_sheet(shape) for shape in self.shapes])
+
+
 class Dots(NamedTuple):
     """A dot for each lane."""
 
     run: Frames
 
 
-Drawable = Surface | Lines | Bodies | Dots
-Look = Lattice | Springs | Shape | Sequence[Shape]
+Drawable = Surface | Lines | Bodies | PlanarFigures | Dots
+Look = Lattice | Springs | BodyShapes
 """What a user may say that a run is drawn as."""
 
 
@@ -59,13 +76,15 @@ def choose_drawable(
 ) -> Drawable:
     """What a film is drawn as by `shown`: a lattice with faces, springs, a lattice of them, a `Shape` or one for each body.
 
-    Without it bodies are boxes of their own inertia, nodes are joined by the springs of the scene, and all else is dots.
-    Of a batch of scenes `scene` picks one. Raises TypeError or ValueError for what does not fit.
+    Without it bodies are boxes of their own inertia, in the plane the shapes of the scene's `Solids`; nodes are joined by
+    the springs of the scene, and all else is dots. Of a batch of scenes `scene` picks one. Raises TypeError or ValueError
+    for what does not fit.
     """
     if shown is None and isinstance(film, Trajectory) and film.scene is not None and film.state is not None:
         shown = find_default_look(film)
     # a lattice is a tuple as well
-    bodies = shown if isinstance(shown, Shape | list | tuple) and not isinstance(shown, Lattice) else None
+    given = isinstance(shown, Shape | PlanarShape | list | tuple) and not isinstance(shown, Lattice)
+    bodies = cast("BodyShapes | None", shown) if given else None
     if scene is not None and (shown is None or bodies is not None):
         raise ValueError(
             f"{who}: got scene={scene}, expected none: all lanes are drawn side by side. It picks one of a batch of "
@@ -73,8 +92,12 @@ def choose_drawable(
         )
     if shown is None:
         return Dots(take_lanes(who, film, dims))
+    if bodies is not None and isinstance(film.state, PlanarBodies) and 2 in dims:
+        run, angle = check_planar_bodies(who, film)
+        shapes = cast("PlanarShape | Sequence[PlanarShape]", bodies)
+        return PlanarFigures(run, angle, list_shapes(who, shapes, angle.shape[1]))
     if bodies is not None:
-        return Bodies(*check_shapes(who, film, bodies))
+        return Bodies(*check_shapes(who, film, cast("Shape | Sequence[Shape]", bodies)))
     if isinstance(shown, Lattice) and len(shown.faces):
         faces, nodes = get_faces(who, shown)
         return Surface(take_frames(who, film, scene=scene, nodes=nodes, dims=dims), faces)
@@ -83,11 +106,21 @@ def choose_drawable(
 
 
 def find_default_look(film: Trajectory) -> Look | None:
-    """What the scene of a film is drawn as: boxes for bodies, its springs (not those of a line), or None."""
+    """What the scene of a film is drawn as: boxes for bodies, in the plane their shapes, springs not on a line, or None."""
     scene = film.scene
     if scene is None:
         return None
     if isinstance(film.state, RigidBodies):
-        return [build_inertia_box(scene.mass, lane) for lane in np.ndindex(scene.state.position.shape[:-1])]
+        return build_inertia_boxes("find_default_look", film)
+    if isinstance(film.state, PlanarBodies):
+        return find_planar_shapes(film)
     springs = [force for force in scene.forces if isinstance(force, Springs)]
     return springs[0] if springs and film.position.shape[-1] > 1 else None
+
+
+def _build_sheet(shape: PlanarShape) -> Shape:
+    """A shape of the plane as triangles from one of its corners to its other edges."""
+    corners = build_planar_outline(shape).corners
+    ends = np.arange(1, len(corners) - 1)
+    faces = np.stack([np.zeros_like(ends), ends, ends + 1], axis=-1)
+    return Shape(np.pad(corners, [(0, 0), (0, 1)]), faces)

@@ -1,7 +1,8 @@
 """Runs for Blender, engines and other programs: animated glTF, and PLY files frame by frame. `Trajectory.save` writes NPZ.
 
 `shown` says what a run is exported as, as in `animate.view`: a lattice with faces, springs, a `solids` shape or one for
-each body. Without it bodies are boxes of their inertia and nodes are joined by the springs of the scene.
+each body. Without it bodies are boxes of their inertia, in the plane the shapes of the scene's `rigid.Solids`, and nodes
+are joined by the springs of the scene.
 
 Metres. glTF has y up, and its root node turns a scene with another axis up; PLY has the axes of the scene. In the plane
 z is 0.
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from physjax.files import write_atomically, write_folder_atomically
-from physjax.show.drawables import Bodies, Dots, Lines, Look, Surface, choose_drawable
+from physjax.show.drawables import Bodies, Dots, Lines, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
 from physjax.show.frames import Frames, find_batch_index, find_intact_springs
 from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document, Json
@@ -65,6 +66,7 @@ def gltf(
     who = "export.gltf"
     path = check_output_path(path, (".glb",))
     seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
+    seen = seen.solids() if isinstance(seen, PlanarFigures) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
     place = _require_finite_positions(who, seen.run, frames)
     if not isinstance(seen, Bodies):
@@ -110,6 +112,7 @@ def ply(
     who = "export.ply"
     folder = Path(folder)
     seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
+    seen = seen.solids() if isinstance(seen, PlanarFigures) else seen
     seen = seen.surface() if isinstance(seen, Bodies) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
     held = _find_intact(who, film, seen, scene) if isinstance(seen, Lines) else None

@@ -194,7 +194,7 @@ def _build_frames(
         known = " or ".join(map(str, dims))
         raise ValueError(
             f"{who}: got positions with {dim} component{'s' * (dim > 1)}, expected {known}. "
-            f"{'plot.springs and animate.springs draw' if dims == (3,) else 'plot.paths draws'} others."
+            f"{'plot.springs, animate.springs and animate.bodies draw' if dims == (3,) else 'plot.paths draws'} others."
         )
     if not whole[0]:
         raise ValueError(f"{who}: got a film whose first frame is not finite, expected a start that can be drawn.")

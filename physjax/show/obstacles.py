@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from physjax.parts import Contact
+from physjax.physics.rigid.planar import Solids
 from physjax.physics.rigid.surface_contact import SurfaceContact
 from physjax.show import level_sets, outlines
 from physjax.show.outlines import Outline
@@ -41,9 +42,16 @@ class Solid(NamedTuple):
 
 
 def select_shared_surfaces(contacts: tuple[Contact, ...], dim: int = 3) -> tuple[Contact, ...]:
-    """The surfaces that are the same for all lanes; of a contact of bodies with a surface, the surface."""
-    surfaces = (contact.surface if isinstance(contact, SurfaceContact) else contact for contact in contacts)
+    """The surfaces that are the same for all lanes; of a contact of bodies with surfaces, these."""
+    surfaces = (surface for contact in contacts for surface in _list_surfaces(contact))
     return tuple(surface for surface in surfaces if level_sets.is_shared(surface, dim))
+
+
+def _list_surfaces(contact: Contact) -> tuple[Contact, ...]:
+    """The surfaces that a contact is about: those of bodies with a surface, of solids with several, else itself."""
+    if isinstance(contact, Solids):
+        return contact.surfaces
+    return (contact.surface,) if isinstance(contact, SurfaceContact) else (contact,)
 
 
 def include_obstacles(

@@ -94,7 +94,7 @@ def view(
     frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
     Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; 2-D films are for
-    `animate.paths` and `animate.springs`.
+    `animate.paths`, `animate.springs` and `animate.bodies`.
 
     Example:
         >>> animate.view(wave, sheet).save("wave.html").name
@@ -112,7 +112,7 @@ def view(
     elif isinstance(seen, Lines):
         part = _describe_lines(who, film, seen, find_batch_index(who, film, scene), scenery, frames)
     else:
-        part = _describe_dots(who, seen, scenery, frames, color)
+        part = _describe_dots(who, cast("Dots", seen), scenery, frames, color)
     return View(
         {
             "frames": frames,

@@ -10,10 +10,12 @@ from physjax.scenes.orbits import read_newtonian_places
 from physjax.scenes.registry import read_table
 
 SLOW = ("car", "ragdoll", "tumbling_box", "rolling", "bowling", "smoke", "sparks", "stiff_flag", "stiff_jelly")
+PILES = ("box_on_slope", "stack_of_ten", "stack_of_sizes", "pyramid", "card_house")
+SOLIDS = (*PILES, "newtons_cradle", "billiard_break", "dominoes", "marble_run", "see_saw")
 """What compiles for many seconds."""
 
 
-@pytest.fixture(params=[pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in SCENES])
+@pytest.fixture(params=[pytest.param(n, marks=pytest.mark.slow) if n in (*SLOW, *SOLIDS) else n for n in SCENES])
 def problem(request):
     return SCENES[request.param]()
 

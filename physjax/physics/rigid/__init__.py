@@ -11,6 +11,13 @@ those that can touch; `contacts=(SurfaceContact(hull, surface), Balls(radius))` 
 `Joints` hold bodies together.
 """
 
+from physjax.physics.rigid.body_points import (
+    angular_acceleration,
+    angular_velocity,
+    point,
+    point_acceleration,
+    point_velocity,
+)
 from physjax.physics.rigid.contact_points import ContactPoints
 from physjax.physics.rigid.joints import Joints, hinge
 from physjax.physics.rigid.loads import (
@@ -20,13 +27,10 @@ from physjax.physics.rigid.loads import (
     Torque,
     bodies,
     on_bodies,
-    point,
-    point_acceleration,
-    point_velocity,
 )
 from physjax.physics.rigid.pairs import Balls
 from physjax.physics.rigid.planar import PlanarBodies, PlanarInertia, PlanarShape, Solids, planar_bodies
-from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_acceleration, angular_velocity
+from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench
 from physjax.physics.rigid.surface_contact import Hull, SurfaceContact, Touch
 
 __all__ = [

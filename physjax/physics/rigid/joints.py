@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from physjax.checks import Numbers, as_real_quantity, quantity, unchecked_quantity
 from physjax.loops import Time
@@ -55,6 +55,12 @@ class Joints(Load):
         self.pairs = tuple((int(i), int(j)) for i, j in pairs)
         self.stiffness = as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
+
+    def __call__(self, t: Time, state: PyTree, mass: PyTree) -> Wrench:
+        """The wrench; a TypeError for a state that is not of bodies in space."""
+        if not isinstance(state, RigidBodies):
+            raise TypeError(f"Joints: got a state of type {type(state).__name__}, expected RigidBodies.")
+        return self.wrench(t, state, mass)
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """Forces and torques on all bodies, with equal and opposite forces at each joint."""

@@ -1,28 +1,29 @@
-"""Loads on rigid bodies, their initial state, and the motion of their points."""
+"""Loads on rigid bodies in space and in the plane, and the initial state of those in space."""
 
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from physjax.checks import Numbers, as_real_quantity, quantity
+from physjax.checks import Numbers, OptionalNumbers, as_real_quantity, quantity
 from physjax.loops import Time
 from physjax.particles import Particles
 from physjax.parts import Force, adopt_force
-from physjax.physics.rigid.inertia import Inertia, check_quaternion
-from physjax.physics.rigid.spatial import (
-    Load,
-    OnBodies,
-    RigidBodies,
-    Wrench,
-    angular_acceleration,
+from physjax.physics.rigid.body_points import (
+    AnyInertia,
+    Bodies,
     angular_velocity,
+    follow_arm,
+    measure_torque,
+    point,
     to_world_frame,
 )
-from physjax.scene import Scene
-from physjax.vectors import broadcast_vector, cross, rotate_vector, rotate_vector_back, scale
+from physjax.physics.rigid.inertia import Inertia, check_quaternion
+from physjax.physics.rigid.planar.bodies import PlanarBodies
+from physjax.physics.rigid.spatial import Load, OnBodies, RigidBodies, Wrench
+from physjax.vectors import broadcast_vector, rotate_vector, rotate_vector_back, scale
 
 
 def bodies(
@@ -75,64 +76,27 @@ def on_bodies(function: Callable[..., Wrench], *, couples: bool = False) -> Load
     return OnBodies(function, couples)
 
 
-# points of a body
-
-
-def point(bodies: RigidBodies, place: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """Position of a point of each body [m]: x + R p.
-
-    Example:
-        >>> print(rigid.point(body, (0.5, 0.0, 0.0)))
-        [0.5 0.  0. ]
-    """
-    return bodies.position + to_world_frame(bodies, place)
-
-
-def point_velocity(bodies: RigidBodies, inertia: Inertia, place: ArrayLike) -> Float[Array, "*lanes 3"]:
-    """Velocity of a point of each body [m/s]: v + ω × r.
-
-    Example:
-        >>> print(rigid.point_velocity(body, brick, (0.5, 0.0, 0.0)))
-        [1. 1. 0.]
-    """
-    return _follow_arm(bodies, inertia, to_world_frame(bodies, place)).velocity
-
-
-def point_acceleration(
-    scene: Scene, t: ArrayLike, place: ArrayLike, state: RigidBodies | None = None
-) -> Float[Array, "*lanes 3"]:
-    """Acceleration of a point of each body [m/s²]: a + ω̇ × r + ω × (ω × r), at `scene.state` unless a state is given.
-
-    Example:
-        >>> print(rigid.point_acceleration(Scene(body, brick), 0.0, (0.5, 0.0, 0.0)))
-        [-2.  0.  0.]
-    """
-    bodies = scene.state if state is None else state
-    rate, r = scene.rate(t, bodies), to_world_frame(bodies, place)
-    omega = angular_velocity(bodies, scene.mass)
-    change = angular_acceleration(bodies, scene.mass, rate.angular_momentum)
-    return scale(1 / scene.mass.mass, rate.momentum) + cross(change, r) + cross(omega, cross(omega, r))
-
-
 # loads
 
 
 class Torque(Load):
-    """A constant torque [N m] in the frame of the "world" or of the "body".
+    """A constant torque [N m] in the frame of the "world" or of the "body"; in the plane a number, anticlockwise.
 
     Example:
         >>> print(loads(Scene(body, brick, (rigid.Torque((0.0, 0.0, 5.0)),)), 0.0).torque)
         [0. 0. 5.]
     """
 
-    torque: Numbers = quantity("torque", "N m", kind="vector")
+    torque: Numbers = quantity("torque", "N m", kind="axial")
     frame: str = eqx.field(static=True, default="world")
 
     def __check_init__(self):
         _demand_frame(self.frame)
 
-    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: Bodies, inertia: AnyInertia) -> Wrench:
         """The torque, and no force."""
+        if isinstance(bodies, PlanarBodies):
+            return Wrench(torque=jnp.broadcast_to(self.torque, bodies.lanes))
         world = self.frame == "world"
         return Wrench(
             torque=broadcast_vector(self.torque, bodies.position) if world else to_world_frame(bodies, self.torque)
@@ -150,13 +114,15 @@ class RotationalDrag(Load):
 
     coefficient: Numbers = quantity("drag coefficient c", "N m s", at_least=0)
 
-    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: Bodies, inertia: AnyInertia) -> Wrench:
         """The torque, and no force."""
         return Wrench(torque=scale(-self.coefficient, angular_velocity(bodies, inertia)))
 
 
 class Thrust(Load):
     """A force [N] fixed to the body, at a `point` [m] of it, like that of an engine: F = R f, τ = r × F.
+
+    Without a point it acts at the center of mass.
 
     Example:
         >>> engine = rigid.Thrust((3.0, 0.0, 0.0), point=(0.0, 2.0, 0.0))
@@ -165,12 +131,14 @@ class Thrust(Load):
     """
 
     force: Numbers = quantity("thrust", "N", kind="vector")
-    point: Numbers = quantity("point of the body", "m", kind="place", default=(0.0, 0.0, 0.0))
+    point: OptionalNumbers = quantity("point of the body", "m", kind="place", default=None)
 
-    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: Bodies, inertia: AnyInertia) -> Wrench:
         """The force and its torque."""
         force = to_world_frame(bodies, self.force)
-        return Wrench(force, cross(to_world_frame(bodies, self.point), force))
+        if self.point is None:
+            return Wrench(force)
+        return Wrench(force, measure_torque(to_world_frame(bodies, self.point), force))
 
 
 class AtPoint(Load):
@@ -214,7 +182,7 @@ class AtPoint(Load):
         """Whether the force jumps in time."""
         return self.force.jumps
 
-    def averaged_over_step(self, t: Time, dt: ArrayLike, state: RigidBodies) -> "AtPoint":
+    def averaged_over_step(self, t: Time, dt: ArrayLike, state: Bodies) -> "AtPoint":
         """The mean of the force over a step; it depends on where the point is, not on how fast it moves."""
         where = point(state, self.point)
         return AtPoint(self.point, self.force.averaged_over_step(t, dt, Particles(where, jnp.zeros_like(where))))
@@ -224,22 +192,16 @@ class AtPoint(Load):
         """Whether the force is conservative."""
         return self.force.has_potential
 
-    def potential(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> Array | None:
+    def potential(self, t: ArrayLike, state: Bodies, mass: AnyInertia) -> Array | None:
         """Its potential energy [J], if it has one."""
-        return self.force.potential(t, _follow_arm(state, mass, to_world_frame(state, self.point)), mass.mass)
+        return self.force.potential(t, follow_arm(state, mass, to_world_frame(state, self.point)), mass.mass)
 
-    def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: Bodies, inertia: AnyInertia) -> Wrench:
         """The force and its torque."""
         # a moment comes only where the force `sees_moments`
         arm = to_world_frame(bodies, self.point)
-        force = self.force(t, _follow_arm(bodies, inertia, arm), inertia.mass)  # pyright: ignore[reportArgumentType]
-        return Wrench(force, cross(arm, force))
-
-
-def _follow_arm(bodies: RigidBodies, inertia: Inertia, arm: Array) -> Particles:
-    """The end of an arm [m] from each center of mass, in the world frame, as a particle: x + r, v + ω × r."""
-    velocity = scale(1 / inertia.mass, bodies.momentum) + cross(angular_velocity(bodies, inertia), arm)
-    return Particles(bodies.position + arm, velocity)
+        force = self.force(t, follow_arm(bodies, inertia, arm), inertia.mass)  # pyright: ignore[reportArgumentType]
+        return Wrench(force, measure_torque(arm, force))
 
 
 def _demand_frame(frame: str) -> None:

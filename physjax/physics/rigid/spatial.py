@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from physjax.backend import materialise
 from physjax.checks import NestedArrayLike, Vectors, as_real_array, as_real_quantity
@@ -40,14 +40,16 @@ from physjax.vectors import (
 class Wrench(NamedTuple):
     """A force [N] and a torque about the center of mass [N m], in the world frame; None where there is none.
 
+    Of bodies in the plane the torque is a number for each lane, anticlockwise.
+
     Example:
         >>> push = rigid.on_bodies(lambda t, bodies, inertia: rigid.Wrench(force=2.0 * bodies.momentum))
         >>> print(loads(Scene(body, brick, (push,)), 0.0).force)
         [24.  0.  0.]
     """
 
-    force: Float[Array, "*lanes 3"] | None = None
-    torque: Float[Array, "*lanes 3"] | None = None
+    force: Float[Array, "*lanes dim"] | None = None
+    torque: Float[Array, "..."] | None = None
 
 
 WholeWrench = tuple[Array, Array]
@@ -63,15 +65,15 @@ class Load(Force):
     """
 
     @abstractmethod
-    def wrench(self, t: Time, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: PyTree, inertia: PyTree) -> Wrench:
         """Force [N] and torque about the center of mass [N m] on each body."""
 
-    def __call__(self, t: Time, state: "RigidBodies", mass: Inertia) -> Wrench:
+    def __call__(self, t: Time, state: PyTree, mass: PyTree) -> Wrench:
         """The wrench; a TypeError for a state that is not of rigid bodies."""
-        if not isinstance(state, RigidBodies):
+        if not state.rotates:
             raise TypeError(
-                f"{type(self).__name__}: got a state of type {type(state).__name__}, expected RigidBodies: it has "
-                "a torque."
+                f"{type(self).__name__}: got a state of type {type(state).__name__}, expected RigidBodies or "
+                "PlanarBodies: it has a torque."
             )
         return self.wrench(t, state, mass)
 
@@ -87,7 +89,7 @@ class OnBodies(Load):
         # a field where other forces have a class attribute: both are read the same way
         self.couples = couples  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def wrench(self, t: Time, bodies: "RigidBodies", inertia: Inertia) -> Wrench:
+    def wrench(self, t: Time, bodies: PyTree, inertia: PyTree) -> Wrench:
         """The function's wrench."""
         return self.function(t, bodies, inertia)
 

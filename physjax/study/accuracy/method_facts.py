@@ -55,16 +55,21 @@ def smallest_size(scene: Scene) -> float:
 def smallest_sizes(scene: Scene) -> np.ndarray:
     """`smallest_size` for each lane, smaller where all of the lane is small next to the others; once per coupled scene.
 
-    Shaped to broadcast with a leaf of the state.
+    Shaped to broadcast with a leaf of the state; of one whose leaves differ in their axes, such as bodies in the plane, the
+    smallest of all lanes.
     """
     axes, ratios = (-2, -1) if scene.couples else (-1,), []
-    for leaf in map(np.asarray, jax.tree.leaves((scene.state, _measure_force(scene)))):
+    lanes = len(scene.state.lanes)
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((scene.state, _measure_force(scene)))]
+    alike = all(leaf.ndim > lanes for leaf in leaves)
+    for leaf in (leaf if leaf.ndim > lanes else leaf[..., None] for leaf in leaves):
         whole = np.sqrt(np.mean(np.square(leaf)))
         if whole > 0:
             ratios.append(np.sqrt(np.mean(np.square(leaf), axis=axes, keepdims=True)) / whole)
     ratio = np.max(ratios, axis=0) if ratios else np.ones(1)
     # a lane at rest in the origin has no size of its own; a larger one never loosens its tolerance
-    return smallest_size(scene) * np.where(ratio > 0, np.minimum(ratio, 1.0), 1.0)
+    size = smallest_size(scene) * np.where(ratio > 0, np.minimum(ratio, 1.0), 1.0)
+    return size if alike else np.asarray(size.min())
 
 
 def depends_on_velocity(scene: Scene) -> bool:

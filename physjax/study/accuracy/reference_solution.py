@@ -281,11 +281,13 @@ def nudge_start(scene: Scene, states: PyTree, share: float = NUDGE_SHARE, seed: 
 
     Lanes that are coupled have their largest in common.
     """
-    rng = np.random.default_rng(seed)
+    rng, lanes = np.random.default_rng(seed), len(scene.state.lanes)
 
     def draw_change(leaf: Array, over: np.ndarray) -> np.ndarray:
         over_time = np.abs(np.asarray(over)).max(axis=0)
-        largest = over_time.max(axis=(-2, -1) if scene.couples else -1, keepdims=True)
+        # an angle is a number for each lane, without an axis of components
+        own = tuple(range(lanes - 1 if scene.couples else lanes, over_time.ndim))
+        largest = over_time.max(axis=own, keepdims=True)
         return rng.normal(size=leaf.shape) * largest
 
     change = jax.tree.map(draw_change, scene.state, states)

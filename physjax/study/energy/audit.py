@@ -22,16 +22,19 @@ from physjax.particles import callable_name
 from physjax.parts import Force
 from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
 from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.response import collide, fold_body_flights
+from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene, Stage, free_motion
 from physjax.stepping.reference import build_default_solver, cast_floats
 from physjax.study import energy
+from physjax.study.energy.solids import fold_solid_flights
 from physjax.trajectory import Trajectory
 from physjax.vectors import scale
 
 NUMERICAL, PINS, PIVOTS = "numerical", "pins", "pivots"
-RESPONSE_OBSERVERS = {impact: fold_flights, collide: fold_body_flights}
-"""How the legs of a response's steps are observed. Particles have the one, bodies the other."""
+RESPONSE_OBSERVERS = {impact: fold_flights, collide: fold_body_flights, solve_contacts: fold_solid_flights}
+"""How the legs of a response's steps are observed: of particles, of bodies in space, and of bodies in the plane."""
 Amounts = dict[str, Array]
 """Energy, momentum and, beyond one dimension, angular momentum, by name."""
 EnergyBudget = dict[str, dict[str, Any]]
@@ -318,7 +321,7 @@ def _compute_rates(whole: Scene, scene: Scene, t: Array, state: PyTree) -> tuple
     """Time derivative of the state, and what each force, and what the constraints bring in a second."""
     rate = scene.rate(t, state)
     felt = state if scene.prescribed_motion is None else scene.prescribed_motion.prescribe(t, state)
-    felt = felt.on_pivot(scene.mass) if felt.rotates else felt  # pyright: ignore[reportAttributeAccessIssue]  # of bodies
+    felt = felt.on_pivot(scene.mass) if isinstance(felt, RigidBodies) else felt
     works = [_transfer_rates(whole, t, felt, _single_force_rate(scene, t, felt, force)) for force in scene.forces]
     holding = _transfer_rates(whole, t, felt, rate)
     for work in works:

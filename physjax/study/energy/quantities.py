@@ -83,14 +83,18 @@ def angular_momentum(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, 
     """
     r, p = state.position, state.linear_momentum(scene.mass)
     if r.shape[-1] == 2:
-        return summed(scene, r[..., 0] * p[..., 1] - r[..., 1] * p[..., 0])
+        arms = r[..., 0] * p[..., 1] - r[..., 1] * p[..., 0]
+        return summed(scene, arms + state.own_spin(scene.mass) if state.rotates else arms)
     spin = cross(r, p) + state.own_spin(scene.mass) if state.rotates else cross(r, p)
     return jnp.sum(spin, axis=-2) if scene.couples else spin
 
 
 def _angular_momentum_size(scene: Scene, state: PyTree) -> Array:
     arms = norm(state.position) * norm(state.linear_momentum(scene.mass))
-    return arms + norm(state.own_spin(scene.mass)) if state.rotates else arms
+    if not state.rotates:
+        return arms
+    own = state.own_spin(scene.mass)
+    return arms + (jnp.abs(own) if state.position.shape[-1] == 2 else norm(own))
 
 
 def summed(scene: Scene, per_lane: Array) -> Array:
