@@ -2,8 +2,10 @@
 
 In each round, over the contacts that approach fast enough to close their gap in the sub-step: v_n' >= -K_r v_n, impulses
 >= 0, and either is zero; friction takes at most μ times the normal impulse. What would rebound too slowly to be told from
-rest keeps the speed that closes its gap. Rounds are repeated until none approaches so fast. All touching points at once would send a cradle
-off as (-0.6, 0.4, 0.4, 0.4, 0.4): with the right energy and momentum, and wrong.
+rest keeps the speed that closes its gap. Rounds are repeated until none approaches so fast.
+
+All touching points at once would send a cradle off as (-0.6, 0.4, 0.4, 0.4, 0.4): with the right energy and momentum, and
+wrong.
 """
 
 from typing import NamedTuple

@@ -241,14 +241,14 @@ def _find_contacts(world: World, pose: Pose, t: ArrayLike) -> _Touching:
         return jax.tree.map(partial(_take_groups, groups), manifold)
 
     normal, points, gaps, is_point = materialise(t, group)
-    rows = jnp.asarray(groups.a), jnp.asarray(groups.b)
-    x, y = (jnp.pad(part, ((0, groups.rows - world.size), (0, 0))) for part in pose.place[:2])
-    arm = tuple((points[0] - x[row][None], points[1] - y[row][None]) for row in rows)
-    mass, moment = (
-        tuple(jnp.pad(number, ((0, groups.rows - world.size), (0, 0)))[row] for row in rows)
-        for number in (world.mass, world.moment)
-    )
-    carried = tuple(_take_groups(groups, part) for part in _find_surface_velocities(world, len(a)))
+    (a_rows, b_rows), (x, y) = (groups.a, groups.b), pose.place[:2]
+    pick = lambda part, rows: jnp.pad(part, ((0, groups.rows - world.size), (0, 0)))[jnp.asarray(rows)]  # noqa: E731
+    reach = lambda rows: (points[0] - pick(x, rows)[None], points[1] - pick(y, rows)[None])  # noqa: E731
+    arm = reach(a_rows), reach(b_rows)
+    mass = pick(world.mass, a_rows), pick(world.mass, b_rows)
+    moment = pick(world.moment, a_rows), pick(world.moment, b_rows)
+    vx, vy = _find_surface_velocities(world, len(a))
+    carried = _take_groups(groups, vx), _take_groups(groups, vy)
     friction, restitution = (_take_groups(groups, number) for number in _mix_materials(world, (a, b), dtype))
     contacts = build_contacts(normal, arm, carried, mass, moment, friction, is_point)
     return _Touching(contacts, (gaps[0], gaps[1]), restitution)
