@@ -104,6 +104,19 @@ def test_a_push_moves_what_friction_does_not_hold():
     assert np.abs(gained[:3]).max() < 1e-12
 
 
+def test_what_rests_is_held_by_static_friction_and_what_slides_by_kinetic():
+    push = np.array([0.5, 0.7]) * 9.8  # between μ_k and μ_s, and beyond both
+    road = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0, coulomb=contacts.Coulomb(0.6, 0.4))
+    scene = Scene(
+        rigid.planar_bodies(CRATE, np.tile([0.0, 0.5], (2, 1, 1))),
+        CRATE,
+        (forces.Gravity(), forces.Constant(np.stack([push, 0 * push], axis=-1)[:, None])),
+        contacts=(rigid.Solids(SQUARE, (road,)),),
+    )
+    speed = simulate(scene, methods.verlet, dt=1 / 60, steps=90).state.momentum[..., 0, 0]
+    np.testing.assert_allclose(speed[-1] - speed[60], [0.0, 0.3 * 9.8 / 2], atol=2e-3)
+
+
 def test_a_box_on_a_slope_rests_below_the_angle_of_friction_and_slides_above():
     friction, above = 0.5, np.deg2rad(0.05)
     for angle, slides in ((np.arctan(friction) - above, False), (np.arctan(friction) + above, True)):

@@ -107,4 +107,4 @@ def _round_speed(velocity: Velocity, units: int) -> Array:
     return units * float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(y)), axis=0)
 
 
-__all__ = ["Bouncing", "resolve_impacts"]
+__all__ = ["ROUNDING", "Bouncing", "resolve_impacts"]

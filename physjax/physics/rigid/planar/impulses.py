@@ -223,6 +223,16 @@ def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Po
     return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
 
 
+def measure_slips(velocity: Velocity, groups: Groups, contacts: Contacts) -> Array:
+    """How fast b moves along the tangent of every contact [m/s]."""
+
+    def measure(group: tuple) -> Array:
+        (a, b), contacts = group
+        return _find_speeds((_pick_rows(velocity, a), _pick_rows(velocity, b)), contacts)[0]
+
+    return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
+
+
 def sum_impulses(contacts: Contacts, impulses: Impulses, incidence: Sides) -> Velocity:
     """What impulses in groups change in the velocities of all bodies; `incidence` says which contacts each is a and b of."""
     (on_a, on_b), (of_a, of_b) = incidence, find_changes(contacts, impulses)
@@ -238,6 +248,7 @@ __all__ = [
     "Velocity",
     "build_contacts",
     "find_changes",
+    "measure_slips",
     "measure_speeds",
     "sum_impulses",
     "sweep_contacts",

@@ -21,7 +21,7 @@ from physjax.loops import Time, to_float_time
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.contacts.surface import Surface
 from physjax.physics.rigid.planar.bodies import PlanarBodies
-from physjax.physics.rigid.planar.impacts import Bouncing, resolve_impacts
+from physjax.physics.rigid.planar.impacts import ROUNDING, Bouncing, resolve_impacts
 from physjax.physics.rigid.planar.impulses import (
     SOFT,
     Contacts,
@@ -30,6 +30,7 @@ from physjax.physics.rigid.planar.impulses import (
     Points,
     Velocity,
     build_contacts,
+    measure_slips,
     measure_speeds,
     sum_impulses,
     sweep_contacts,
@@ -114,11 +115,12 @@ def _build_world(solids: SolidContact, scene: Scene) -> World:
 
 
 class _Touching(NamedTuple):
-    """Contacts in groups, the gaps of both points [m], and K_r."""
+    """Contacts in groups, the gaps of both points [m], K_r, and μ_s; the contacts have μ_k."""
 
     contacts: Contacts
     gap: Points
     restitution: Array
+    static: Array
 
 
 def _take_substep(
@@ -135,11 +137,23 @@ def _take_substep(
     start, moved = (_read_pose(state, scene) for state in states)
     touching = _find_contacts(world, start, t)
     free = mean, end = _map(lambda a, b: (b - a) / h, start.place, moved.place), moved.rate
-    impact = _map(jnp.subtract, _bounce(world, touching, (start.rate, mean, end), h), start.rate)
+    changes = [jnp.max(jnp.abs(after - now), axis=0) for now, after in zip(start.rate[:2], end[:2], strict=True)]
+    slow = REST_SPEED_STEPS * jnp.maximum(*changes)
+    touching = _stick(world, touching, start.rate, slow)
+    impact = _map(jnp.subtract, _bounce(world, touching, (start.rate, mean), slow, h), start.rate)
     bounced = _map(jnp.add, mean, impact), _map(jnp.add, end, impact)
     moves, impulses = _hold_apart(world, touching, bounced, impulses, h)
     places, rates = (_map(jnp.subtract, after, before) for after, before in zip(moves, free, strict=True))
     return _write_pose(states[1], _map(lambda part: h * part, places), rates, scene), impulses
+
+
+def _stick(world: World, touching: _Touching, rate: Velocity, slow: Array) -> _Touching:
+    """The contacts with static friction where they do not slip, or so slowly that forces may have just begun it."""
+    contacts, rounding = touching.contacts, ROUNDING * float(jnp.finfo(slow.dtype).eps)
+    slip = jnp.abs(measure_slips(_pad(world.groups, rate), world.groups, contacts))
+    fastest = jnp.maximum(*(jnp.max(jnp.abs(part), axis=0) for part in rate[:2]))
+    sticks = slip <= (slow + rounding * fastest)[None, None]
+    return touching._replace(contacts=contacts._replace(friction=jnp.where(sticks, touching.static, contacts.friction)))
 
 
 def _hold_apart(
@@ -151,7 +165,7 @@ def _hold_apart(
     needs, and none of what stops a motion once, which both have in common. It is what the next sub-step starts with; its
     impulses at the end start with those that it has found in the mean. So errors of a sweep do not feed on themselves.
     """
-    (mean, end), groups, (contacts, gap, _) = velocities, world.groups, touching
+    (mean, end), groups, (contacts, gap, *_) = velocities, world.groups, touching
     push = sum_impulses(contacts, held, _build_incidence(world, mean[0].dtype))
     overlaps = gap[0] <= 0, gap[1] <= 0
     each = h[None]
@@ -172,17 +186,16 @@ def _hold_apart(
     return (moves, _cut(world, stops)), left
 
 
-def _bounce(world: World, touching: _Touching, velocities: tuple[Velocity, Velocity, Velocity], h: Array) -> Velocity:
+def _bounce(
+    world: World, touching: _Touching, velocities: tuple[Velocity, Velocity], slow: Array, h: Array
+) -> Velocity:
     """Velocities at the start of a sub-step after the impacts of all that would reach each other in it."""
-    groups, (contacts, gap, restitution) = world.groups, touching
-    before, mean, end = velocities
-    start, middle = (measure_speeds(_pad(groups, part), groups, contacts) for part in (before, mean))
-    changes = [jnp.max(jnp.abs(after - now), axis=0) for now, after in zip(before[:2], end[:2], strict=True)]
-    slow = REST_SPEED_STEPS * jnp.maximum(*changes)
+    groups, (contacts, gap, restitution, _) = world.groups, touching
+    start, middle = (measure_speeds(_pad(groups, part), groups, contacts) for part in velocities)
     # forces change by `u - v` how fast the gap closes
     reach = [s / h[None] + (u - v) for s, u, v in zip(gap, middle, start, strict=True)]
     bouncing = Bouncing(restitution, slow, (reach[0], reach[1]))
-    return _cut(world, resolve_impacts(_pad(groups, before), groups, contacts, bouncing))
+    return _cut(world, resolve_impacts(_pad(groups, velocities[0]), groups, contacts, bouncing))
 
 
 def _map(function: Callable[..., Array], *parts: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -249,9 +262,10 @@ def _find_contacts(world: World, pose: Pose, t: ArrayLike) -> _Touching:
     moment = pick(world.moment, a_rows), pick(world.moment, b_rows)
     vx, vy = _find_surface_velocities(world, len(a))
     carried = _take_groups(groups, vx), _take_groups(groups, vy)
-    friction, restitution = (_take_groups(groups, number) for number in _mix_materials(world, (a, b), dtype))
-    contacts = build_contacts(normal, arm, carried, mass, moment, friction, is_point)
-    return _Touching(contacts, (gaps[0], gaps[1]), restitution)
+    numbers = _mix_materials(world, (a, b), dtype)
+    static, kinetic, restitution = (_take_groups(groups, number) for number in numbers)
+    contacts = build_contacts(normal, arm, carried, mass, moment, kinetic, is_point)
+    return _Touching(contacts, (gaps[0], gaps[1]), restitution, static)
 
 
 def _place_shapes(solids: SolidContact, pose: Pose, dtype: np.dtype) -> Outline:
@@ -283,17 +297,16 @@ def _find_surface_velocities(world: World, pairs: int) -> Vector:
     return x, y
 
 
-def _mix_materials(world: World, pairs: tuple[np.ndarray, np.ndarray], dtype: np.dtype) -> tuple[Array, Array]:
-    """μ and K_r of every contact, `(contacts, 1)`: the mean of two bodies, of a surface its own."""
+def _mix_materials(world: World, pairs: tuple[np.ndarray, np.ndarray], dtype: np.dtype) -> list[Array]:
+    """μ_s, μ_k and K_r of every contact, `(contacts, 1)`: the mean of two bodies, of a surface its own."""
     solids, bodies = world.solids, world.size
     mean = lambda number: sum(jnp.broadcast_to(number, (bodies,))[rows] for rows in pairs) / 2  # noqa: E731
     own = lambda numbers: [jnp.full(bodies, number, dtype) for number in numbers]  # noqa: E731
-    rough = 0.0 if solids.coulomb is None else solids.coulomb.kinetic
-    surfaces = [slot.surface for slot in world.slots]
-    grips = [0.0 if surface.coulomb is None else surface.coulomb.kinetic for surface in surfaces]
-    friction = jnp.concatenate([mean(jnp.asarray(rough, dtype)), *own(grips)])[:, None]
-    restitution = [mean(solids.restitution), *own([surface.restitution for surface in surfaces])]
-    return friction, jnp.concatenate(restitution)[:, None]
+    parts = [solids, *(slot.surface for slot in world.slots)]
+    dry = [(0.0, 0.0) if part.coulomb is None else (part.coulomb.static, part.coulomb.kinetic) for part in parts]
+    kinds = [*zip(*dry, strict=True), [part.restitution for part in parts]]
+    each = [[mean(jnp.asarray(first, dtype)), *own(others)] for first, *others in kinds]
+    return [jnp.concatenate(numbers)[:, None] for numbers in each]
 
 
 def _build_incidence(world: World, dtype: np.dtype) -> tuple[Array, Array]:
