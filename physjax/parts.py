@@ -249,7 +249,8 @@ class Contact(eqx.Module):
 
     def demand_fit(self, state: PyTree, mass: PyTree) -> None:
         """Raise a TypeError for a state of another kind, and a ValueError for lanes that start on the wrong side."""
-        demand_particles("contacts", state, "rigid bodies need rigid.SurfaceContact(hull, plane)")
+        hint = "rigid bodies need rigid.SurfaceContact(hull, plane), those in the plane rigid.Solids(shapes, (plane,))"
+        demand_particles("contacts", state, hint)
         demand_start_outside(self, state)
 
     def prepare(self, state: PyTree, couples: bool) -> "Contact":

@@ -43,7 +43,7 @@ def box_on_slope(angle: float = 0.4, friction: float = 0.3, g: float = 9.8) -> P
 
 @scene
 def stack_of_ten(offset: float = 0.02, g: float = 9.8) -> Problem:
-    """Ten crates on top of each other, each a little beside the one below: they stay where they are."""
+    """Ten crates on top of each other, each slightly offset from the one below: they stay where they are."""
     shift = offset * np.array([0.0, 1.0, -0.7, 0.4, -1.0, 0.8, -0.2, 0.6, -0.9, 0.3])
     place = np.stack([shift, 0.5 + np.arange(10)], axis=-1)
     return _build_pile(np.ones((10, 2)), place, g, [(i, i + 1) for i in range(9)])

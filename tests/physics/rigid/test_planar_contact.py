@@ -1,5 +1,7 @@
 """Bodies that touch in the plane, against momentum, friction's closed forms, and what stacks do."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,6 +139,17 @@ def test_a_box_that_slides_stops_after_its_distance():
     assert np.abs(end.momentum[-1]).max() < 1e-9
 
 
+def test_a_conveyor_takes_a_box_along():
+    belt = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0, coulomb=rough(0.5), velocity=(2.0, 0.0))
+    box = rigid.planar_bodies(CRATE, [[0.0, 0.5]])
+    scene = Scene(box, CRATE, (forces.Gravity(),), contacts=(rigid.Solids(SQUARE, (belt,)),))
+    end = simulate(scene, methods.verlet, dt=1 / 60, steps=60, save_every=60).state
+    # μ g until it is as fast as the belt, and with it from then on
+    slips = 2.0 / (0.5 * 9.8)
+    assert end.momentum[-1, 0, 0] == pytest.approx(2.0, abs=1e-12)
+    assert end.position[-1, 0, 0] == pytest.approx(2.0 * (1 - slips / 2), rel=5e-3)
+
+
 # rest
 
 
@@ -209,3 +222,10 @@ def test_what_does_not_fit_is_refused_in_plain_words():
     many = rigid.planar_bodies(CRATE, np.zeros((65, 2)))
     with pytest.raises(ValueError, match="at most 64"):
         Scene(many, CRATE, contacts=(rigid.Solids(SQUARE),))
+    steep = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=np.array([0.0, 0.5]))
+    with pytest.raises(ValueError, match="restitution of Plane for each of the lanes"):
+        Scene(pile, CRATE, contacts=(rigid.Solids(SQUARE, (steep,)),))
+    with pytest.raises(TypeError, match=re.escape("rigid.Solids(shapes, (plane,))")):
+        Scene(pile, CRATE, contacts=(floor(),))
+    with pytest.raises(ValueError, match="got 2 Solids, expected one"):
+        Scene(pile, CRATE, contacts=(rigid.Solids(SQUARE), rigid.Solids(SQUARE))).step(methods.verlet, 0.0, 0.1)

@@ -57,11 +57,11 @@ def resolve_impacts(velocity: Velocity, groups: Groups, contacts: Contacts, boun
     """Velocities of all rows after the impacts."""
 
     def find_approaching(velocity: Velocity) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        speeds = measure_speeds(velocity, groups, contacts)
+        _, *speeds = measure_speeds(velocity, groups, contacts)
         rounding, slow = _round_speed(velocity, ROUNDING)[None, None], bouncing.slow[None, None]
         cases = zip(contacts.is_point, speeds, bouncing.reach, strict=True)
         first, second = (there & (-v > slow + rounding) & (-v * REACH > reach) for there, v, reach in cases)
-        return (first, second), speeds
+        return (first, second), (speeds[0], speeds[1])
 
     def is_going(carry: tuple[Velocity, Array]) -> Array:
         first, second = find_approaching(carry[0])[0]
@@ -102,7 +102,7 @@ def _solve_round(velocity: Velocity, groups: Groups, contacts: Contacts, demand:
 
 
 def _round_speed(velocity: Velocity, units: int) -> Array:
-    """So many units of rounding of the fastest of each world [m/s]."""
+    """`units` of rounding of the fastest body of each world [m/s]."""
     x, y, _ = velocity
     return units * float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(y)), axis=0)
 

@@ -130,10 +130,10 @@ def sweep_contacts(
         (a, b), contacts, demand, impulses = group
         ends = _pick_rows(velocity, a), _pick_rows(velocity, b)
         new = _solve_contact(_find_speeds(ends, contacts), contacts, demand, impulses)
-        change = find_changes(contacts, _map(jnp.subtract, new, impulses))
+        change = _find_changes(contacts, map_components(jnp.subtract, new, impulses))
         for rows, end, more in zip((a, b), ends, change, strict=True):
             write = lambda part, e, m, rows=rows: part.at[rows].set(e + m, unique_indices=True)  # noqa: E731
-            velocity = _map(write, velocity, end, more)
+            velocity = map_components(write, velocity, end, more)
         return velocity, new
 
     rows = jnp.asarray(groups.a), jnp.asarray(groups.b)
@@ -141,10 +141,10 @@ def sweep_contacts(
 
 
 def _pick_rows(velocity: Velocity, rows: Array) -> Velocity:
-    return _map(lambda part: part[rows], velocity)
+    return map_components(lambda part: part[rows], velocity)
 
 
-def _map(function: Callable[..., Array], *parts: tuple[Any, Any, Any]) -> tuple[Array, Array, Array]:
+def map_components(function: Callable[..., Array], *parts: tuple[Any, Any, Any]) -> tuple[Array, Array, Array]:
     """The function of three components, one by one."""
     x, y, z = (function(*each) for each in zip(*parts, strict=True))
     return x, y, z
@@ -154,12 +154,12 @@ def _find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Impulse
     """How fast b moves away from a along each direction [m/s]."""
     ((ax, ay, aw), (bx, by, bw)), (nx, ny), (across, along) = ends, contacts.normal, contacts.carried
     dx, dy = bx - ax, by - ay
-    turning = _map(lambda a, b: b * bw - a * aw, *contacts.torque)
-    straight = nx * dx + ny * dy - along
-    return nx * dy - ny * dx - across + turning[0], straight + turning[1], straight + turning[2]
+    turning = map_components(lambda a, b: b * bw - a * aw, *contacts.torque)
+    straight = nx * dx + ny * dy + along
+    return nx * dy - ny * dx + across + turning[0], straight + turning[1], straight + turning[2]
 
 
-def find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
+def _find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
     """What impulses on b, and the opposite ones on a, change in the velocities of both."""
     (nx, ny), across, along = contacts.normal, impulses[0], impulses[1] + impulses[2]
     px, py = nx * along - ny * across, ny * along + nx * across
@@ -183,7 +183,7 @@ def _solve_contact(speed: Impulses, contacts: Contacts, demand: Demand, impulses
         held = jnp.where(there[0] | there[1], jnp.clip(grip - slip * inverse, -most, most), 0.0)
         changes = held - grip, *more
         rows = (own, first, second), (first, matrix[0], matrix[1]), (second, matrix[1], matrix[2])
-        speed = _map(lambda v, row, c=changes: v + row[0] * c[0] + row[1] * c[1] + row[2] * c[2], speed, rows)
+        speed = map_components(lambda v, row, c=changes: v + row[0] * c[0] + row[1] * c[1] + row[2] * c[2], speed, rows)
         grip, press = held, list(pressed)
     return grip, press[0], press[1]
 
@@ -213,31 +213,21 @@ def _press_both(
     )
 
 
-def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Points:
-    """How fast both points of every contact move apart [m/s]."""
+def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Impulses:
+    """How fast b moves away from a along the tangent of every contact, and along its normal at both points [m/s]."""
 
-    def measure(group: tuple) -> Points:
+    def measure(group: tuple) -> Impulses:
         (a, b), contacts = group
-        return _find_speeds((_pick_rows(velocity, a), _pick_rows(velocity, b)), contacts)[1:]
-
-    return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
-
-
-def measure_slips(velocity: Velocity, groups: Groups, contacts: Contacts) -> Array:
-    """How fast b moves along the tangent of every contact [m/s]."""
-
-    def measure(group: tuple) -> Array:
-        (a, b), contacts = group
-        return _find_speeds((_pick_rows(velocity, a), _pick_rows(velocity, b)), contacts)[0]
+        return _find_speeds((_pick_rows(velocity, a), _pick_rows(velocity, b)), contacts)
 
     return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
 
 
 def sum_impulses(contacts: Contacts, impulses: Impulses, incidence: Sides) -> Velocity:
     """What impulses in groups change in the velocities of all bodies; `incidence` says which contacts each is a and b of."""
-    (on_a, on_b), (of_a, of_b) = incidence, find_changes(contacts, impulses)
+    (on_a, on_b), (of_a, of_b) = incidence, _find_changes(contacts, impulses)
     gather = lambda matrix, part: jnp.dot(matrix, part.reshape(-1, part.shape[-1]), precision=lax.Precision.HIGHEST)  # noqa: E731
-    return _map(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
+    return map_components(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
 
 
 __all__ = [
@@ -247,8 +237,7 @@ __all__ = [
     "Impulses",
     "Velocity",
     "build_contacts",
-    "find_changes",
-    "measure_slips",
+    "map_components",
     "measure_speeds",
     "sum_impulses",
     "sweep_contacts",

@@ -30,7 +30,7 @@ from physjax.physics.rigid.planar.impulses import (
     Points,
     Velocity,
     build_contacts,
-    measure_slips,
+    map_components,
     measure_speeds,
     sum_impulses,
     sweep_contacts,
@@ -83,7 +83,11 @@ class World(NamedTuple):
 
 def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The scene after a step of dt in sub-steps, each of them: the method's own step, impacts, and impulses at contacts."""
-    (number,) = (i for i, contact in enumerate(scene.contacts) if contact.response is solve_contacts)
+    number, *others = (i for i, contact in enumerate(scene.contacts) if contact.response is solve_contacts)
+    if others:
+        raise ValueError(
+            f"contacts: got {1 + len(others)} Solids, expected one: it holds all bodies, shapes= one for each, and all surfaces."
+        )
     solids: Any = scene.contacts[number]
     world = _build_world(solids, scene)
     dt = jnp.asarray(dt, scene.state.dtype)
@@ -136,23 +140,23 @@ def _take_substep(
     h = jnp.broadcast_to(h.reshape(1, -1), (1, world.mass.shape[-1]))
     start, moved = (_read_pose(state, scene) for state in states)
     touching = _find_contacts(world, start, t)
-    free = mean, end = _map(lambda a, b: (b - a) / h, start.place, moved.place), moved.rate
+    free = mean, end = map_components(lambda a, b: (b - a) / h, start.place, moved.place), moved.rate
     changes = [jnp.max(jnp.abs(after - now), axis=0) for now, after in zip(start.rate[:2], end[:2], strict=True)]
     slow = REST_SPEED_STEPS * jnp.maximum(*changes)
-    touching = _stick(world, touching, start.rate, slow)
-    impact = _map(jnp.subtract, _bounce(world, touching, (start.rate, mean), slow, h), start.rate)
-    bounced = _map(jnp.add, mean, impact), _map(jnp.add, end, impact)
+    speeds = measure_speeds(_pad(world.groups, start.rate), world.groups, touching.contacts)
+    touching = _stick(touching, speeds[0], start.rate, slow)
+    impact = map_components(jnp.subtract, _bounce(world, touching, (start.rate, mean), speeds, slow, h), start.rate)
+    bounced = map_components(jnp.add, mean, impact), map_components(jnp.add, end, impact)
     moves, impulses = _hold_apart(world, touching, bounced, impulses, h)
-    places, rates = (_map(jnp.subtract, after, before) for after, before in zip(moves, free, strict=True))
-    return _write_pose(states[1], _map(lambda part: h * part, places), rates, scene), impulses
+    places, rates = (map_components(jnp.subtract, after, before) for after, before in zip(moves, free, strict=True))
+    return _write_pose(states[1], map_components(lambda part: h * part, places), rates, scene), impulses
 
 
-def _stick(world: World, touching: _Touching, rate: Velocity, slow: Array) -> _Touching:
+def _stick(touching: _Touching, slip: Array, rate: Velocity, slow: Array) -> _Touching:
     """The contacts with static friction where they do not slip, or so slowly that forces may have just begun it."""
     contacts, rounding = touching.contacts, ROUNDING * float(jnp.finfo(slow.dtype).eps)
-    slip = jnp.abs(measure_slips(_pad(world.groups, rate), world.groups, contacts))
     fastest = jnp.maximum(*(jnp.max(jnp.abs(part), axis=0) for part in rate[:2]))
-    sticks = slip <= (slow + rounding * fastest)[None, None]
+    sticks = jnp.abs(slip) <= (slow + rounding * fastest)[None, None]
     return touching._replace(contacts=contacts._replace(friction=jnp.where(sticks, touching.static, contacts.friction)))
 
 
@@ -171,46 +175,46 @@ def _hold_apart(
     each = h[None]
     cure = [jnp.where(over, -SOFT.cure * s, -s) / each for over, s in zip(overlaps, gap, strict=True)]
     demand = Demand((cure[0], cure[1]), overlaps, contacts.is_point)
-    moves, pressed = sweep_contacts(_pad(groups, _map(jnp.add, mean, push)), groups, contacts, demand, held)
-    opening = measure_speeds(moves, groups, contacts)
+    moves, pressed = sweep_contacts(_pad(groups, map_components(jnp.add, mean, push)), groups, contacts, demand, held)
+    _, *opening = measure_speeds(moves, groups, contacts)
     cases = zip(contacts.is_point, pressed[1:], gap, opening, strict=True)
     first, second = (is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
     moves = _cut(world, moves)
     # the impulses in the mean act on the end as well
-    end = _map(lambda e, p, after, before: e + p + (after - before), end, push, moves, mean)
+    end = map_components(lambda e, p, after, before: e + p + (after - before), end, push, moves, mean)
     still = jnp.zeros_like(gap[0])
     demand = Demand.hard((still, still), (first, second))
-    stops, stopped = sweep_contacts(_pad(groups, end), groups, contacts, demand, _map(jnp.add, held, pressed))
+    stops, stopped = sweep_contacts(_pad(groups, end), groups, contacts, demand, map_components(jnp.add, held, pressed))
     stays = first | second, first, second
-    left = _map(lambda stay, stop, press: jnp.where(stay, stop - press, 0.0), stays, stopped, pressed)
+    left = map_components(lambda stay, stop, press: jnp.where(stay, stop - press, 0.0), stays, stopped, pressed)
     return (moves, _cut(world, stops)), left
 
 
 def _bounce(
-    world: World, touching: _Touching, velocities: tuple[Velocity, Velocity], slow: Array, h: Array
+    world: World,
+    touching: _Touching,
+    velocities: tuple[Velocity, Velocity],
+    speeds: Impulses,
+    slow: Array,
+    h: Array,
 ) -> Velocity:
     """Velocities at the start of a sub-step after the impacts of all that would reach each other in it."""
     groups, (contacts, gap, restitution, _) = world.groups, touching
-    start, middle = (measure_speeds(_pad(groups, part), groups, contacts) for part in velocities)
+    before, mean = (_pad(groups, velocity) for velocity in velocities)
+    middle = measure_speeds(mean, groups, contacts)
     # forces change by `u - v` how fast the gap closes
-    reach = [s / h[None] + (u - v) for s, u, v in zip(gap, middle, start, strict=True)]
+    reach = [s / h[None] + (u - v) for s, u, v in zip(gap, middle[1:], speeds[1:], strict=True)]
     bouncing = Bouncing(restitution, slow, (reach[0], reach[1]))
-    return _cut(world, resolve_impacts(_pad(groups, velocities[0]), groups, contacts, bouncing))
-
-
-def _map(function: Callable[..., Array], *parts: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """The function of three components, one by one."""
-    x, y, z = (function(*each) for each in zip(*parts, strict=True))
-    return x, y, z
+    return _cut(world, resolve_impacts(before, groups, contacts, bouncing))
 
 
 def _pad(groups: Groups, velocity: Velocity) -> Velocity:
     """The velocities with rows of what does not move after those of the bodies."""
-    return _map(lambda part: jnp.pad(part, ((0, groups.rows - len(part)), (0, 0))), velocity)
+    return map_components(lambda part: jnp.pad(part, ((0, groups.rows - len(part)), (0, 0))), velocity)
 
 
 def _cut(world: World, velocity: Velocity) -> Velocity:
-    return _map(lambda part: part[: world.size], velocity)
+    return map_components(lambda part: part[: world.size], velocity)
 
 
 def _read_pose(state: PlanarBodies, scene: Scene) -> Pose:
@@ -227,7 +231,7 @@ def _read_pose(state: PlanarBodies, scene: Scene) -> Pose:
 def _write_pose(state: PlanarBodies, places: Velocity, rates: Velocity, scene: Scene) -> PlanarBodies:
     """The state with places [m, rad] and velocities changed."""
     by_lane = lambda number: number.T.reshape(state.lanes)  # noqa: E731
-    (x, y, angle), (vx, vy, omega) = _map(by_lane, places), _map(by_lane, rates)
+    (x, y, angle), (vx, vy, omega) = map_components(by_lane, places), map_components(by_lane, rates)
     mass, moment = (jnp.broadcast_to(number, state.lanes) for number in (scene.mass.mass, scene.mass.moment))
     return PlanarBodies(
         state.position + jnp.stack([x, y], axis=-1),

@@ -19,6 +19,7 @@ from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.planar.shapes import PlanarShape
 from physjax.physics.rigid.planar.surfaces import list_slots
 from physjax.physics.rigid.planar_inertia import PlanarInertia
+from physjax.quantities import collect_numbers
 from physjax.scene import Scene
 
 SUBSTEPS = 4
@@ -118,6 +119,12 @@ class Solids(Contact):
             raise ValueError(
                 f"Solids: got {len(self.shapes)} shapes for {state.lanes[-1]} bodies, expected one for all or one for each."
             )
+        for number in collect_numbers((self.surfaces, self.coulomb))[0]:
+            if number.has_lanes(state.lanes, 2):
+                raise ValueError(
+                    f"Solids: got {number.field} of {type(number.owner).__name__} for each of the lanes {state.lanes}, expected "
+                    "one for all: a surface and Coulomb's friction are the same for all bodies and worlds."
+                )
         if self.restitution.shape not in ((), state.lanes[-1:]):
             raise ValueError(
                 f"Solids: got restitution of shape {self.restitution.shape}, expected () or {state.lanes[-1:]}."
