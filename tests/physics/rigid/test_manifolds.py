@@ -76,7 +76,7 @@ def test_gaps_and_normals_are_those_of_the_nearest_points(first, second):
     one, other = SHAPES[first], SHAPES[second]
     a = place(one, other, np.zeros((400, 2)), rng.uniform(-3, 3, 400))
     b = place(other, one, where, rng.uniform(-3, 3, 400))
-    found = jax.jit(find_manifolds)(a, b)
+    found = jax.jit(find_manifolds)(0.0, a, b)
     gap = np.where(found.is_point, found.gaps, np.inf).min(axis=0)[0]
     core = measure_distance(a, b)
     apart = find_disjoint(a, b)

@@ -18,6 +18,7 @@ from physjax.physics.rigid.planar.impulses import (
     Contacts,
     Demand,
     Impulses,
+    Points,
     Velocity,
     measure_speeds,
     sweep_contacts,
@@ -48,40 +49,49 @@ class Bouncing(NamedTuple):
 
 
 class _Round(NamedTuple):
+    """What has been reached so far: velocities, how fast both points of each contact open, and which must bounce."""
+
+    velocity: Velocity
+    speeds: Points
+    active: Points
+    number: Array
+
+
+class _Sweep(NamedTuple):
     velocity: Velocity
     impulses: Impulses
     change: Array
 
 
-def resolve_impacts(velocity: Velocity, groups: Groups, contacts: Contacts, bouncing: Bouncing) -> Velocity:
-    """Velocities of all rows after the impacts."""
+def resolve_impacts(
+    velocity: Velocity, speeds: Points, groups: Groups, contacts: Contacts, bouncing: Bouncing
+) -> Velocity:
+    """Velocities of all rows after the impacts; `speeds` are those of both points of each contact before [m/s]."""
+    slow = bouncing.slow[None, None]
 
-    def find_approaching(velocity: Velocity) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        _, *speeds = measure_speeds(velocity, groups, contacts)
-        rounding, slow = _round_speed(velocity, ROUNDING)[None, None], bouncing.slow[None, None]
+    def begin_round(velocity: Velocity, speeds: Points, number: Array) -> _Round:
+        rounding = _round_speed(velocity, ROUNDING)[None, None]
         cases = zip(contacts.is_point, speeds, bouncing.reach, strict=True)
         first, second = (there & (-v > slow + rounding) & (-v * REACH > reach) for there, v, reach in cases)
-        return (first, second), (speeds[0], speeds[1])
+        return _Round(velocity, speeds, (first, second), number)
 
-    def is_going(carry: tuple[Velocity, Array]) -> Array:
-        first, second = find_approaching(carry[0])[0]
-        return jnp.any(first | second, axis=(0, 1)) & (carry[1] < MAX_ROUNDS)
-
-    def bounce(carry: tuple[Velocity, Array]) -> tuple[Velocity, Array]:
-        velocity, rounds = carry
-        active, speeds = find_approaching(velocity)
-        rebounds = [-bouncing.restitution * v for v in speeds]
-        slow = bouncing.slow[None, None]
+    def bounce(this: _Round) -> _Round:
+        rebounds = [-bouncing.restitution * v for v in this.speeds]
         # what has closed its gap already closes it no further
         first, second = (
             jnp.where(back > slow, back, -jnp.maximum(reach, 0.0))
             for back, reach in zip(rebounds, bouncing.reach, strict=True)
         )
-        demand = Demand.hard((first, second), active)
-        return _solve_round(velocity, groups, contacts, demand), rounds + 1
+        demand = Demand.hard((first, second), this.active)
+        velocity = _solve_round(this.velocity, groups, contacts, demand)
+        _, *opening = measure_speeds(velocity, groups, contacts)
+        return begin_round(velocity, (opening[0], opening[1]), this.number + 1)
 
-    rounds = jnp.zeros(velocity[0].shape[-1:], jnp.int32)
-    return differentiable_while_loop(is_going, bounce, (velocity, rounds), most=MAX_ROUNDS)[0]
+    def is_going(this: _Round) -> Array:
+        return jnp.any(this.active[0] | this.active[1], axis=(0, 1)) & (this.number < MAX_ROUNDS)
+
+    start = begin_round(velocity, speeds, jnp.zeros(velocity[0].shape[-1:], jnp.int32))
+    return differentiable_while_loop(is_going, bounce, start, most=MAX_ROUNDS).velocity
 
 
 def _solve_round(velocity: Velocity, groups: Groups, contacts: Contacts, demand: Demand) -> Velocity:
@@ -90,14 +100,14 @@ def _solve_round(velocity: Velocity, groups: Groups, contacts: Contacts, demand:
     # an impulse changes the speed of a contact by at least that much
     lightness = contacts.mass[0] + contacts.mass[1]
 
-    def sweep(carry: _Round) -> _Round:
+    def sweep(carry: _Sweep) -> _Sweep:
         velocity, impulses = sweep_contacts(carry.velocity, groups, contacts, demand, carry.impulses)
         moved = [jnp.abs(new - old) for new, old in zip(impulses, carry.impulses, strict=True)]
         most = jnp.maximum(jnp.maximum(moved[0], moved[1]), moved[2])
-        return _Round(velocity, impulses, jnp.max(lightness * most, axis=(0, 1)))
+        return _Sweep(velocity, impulses, jnp.max(lightness * most, axis=(0, 1)))
 
     none = jnp.zeros_like(demand.speed[0])
-    start = _Round(velocity, (none, none, none), jnp.full(none.shape[-1:], jnp.inf, none.dtype))
+    start = _Sweep(velocity, (none, none, none), jnp.full(none.shape[-1:], jnp.inf, none.dtype))
     return differentiable_while_loop(lambda carry: carry.change > tolerance, sweep, start, most=MAX_SWEEPS).velocity
 
 

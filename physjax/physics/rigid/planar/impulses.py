@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from physjax.backend import materialise
 from physjax.physics.rigid.planar.manifolds import Vector
 from physjax.physics.rigid.planar.pairs import Groups
 
@@ -94,27 +96,27 @@ SOFT = Softness.of(periods=2.0, damping_ratio=0.5)
 
 
 def build_contacts(
+    t: ArrayLike,
     normal: Vector,
     arm: tuple[Vector, Vector],
     carried: Vector,
-    mass: Sides,
-    moment: Sides,
+    bodies: tuple[Sides, Sides],
     friction: Array,
     is_point: Array,
 ) -> Contacts:
-    """Contacts from normals `(contacts, worlds)`, arms to both points `(2, ...)`, and the velocity of b's surface [m/s]."""
+    """Contacts from normals, arms to both points `(2, ...)`, the velocity of b's surface [m/s], and 1/m and 1/I."""
     nx, ny = normal
     # of two points the line of friction goes through the middle
     middle = lambda c: jnp.where(is_point[1], (c[0] + c[1]) / 2, c[0])  # noqa: E731
     turn = lambda ax, ay: (middle(ax) * nx + middle(ay) * ny, *(ax * ny[None] - ay * nx[None]))  # noqa: E731
-    ta, tb = torque = (turn(*arm[0]), turn(*arm[1]))
+    ta, tb = torque = materialise(t, lambda: (turn(*arm[0]), turn(*arm[1])))
     along, across = carried[0] * nx + carried[1] * ny, carried[1] * nx - carried[0] * ny
-    shared, (ia, ib) = mass[0] + mass[1], moment
+    mass, (ia, ib) = bodies
     pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    parallel = lambda i, j: 0.0 if (i == 0) != (j == 0) else shared  # noqa: E731
+    parallel = lambda i, j: 0.0 if (i == 0) != (j == 0) else mass[0] + mass[1]  # noqa: E731
     coupling = tuple(parallel(i, j) + ia * ta[i] * ta[j] + ib * tb[i] * tb[j] for i, j in pairs)
     points = (is_point[0], is_point[1])
-    return Contacts(normal, torque, (across, along), coupling, mass, moment, friction, points)
+    return Contacts(normal, torque, (across, along), coupling, mass, (ia, ib), friction, points)
 
 
 def sweep_contacts(
@@ -169,37 +171,38 @@ def _find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Vel
 
 
 def _solve_contact(speed: Impulses, contacts: Contacts, demand: Demand, impulses: Impulses) -> Impulses:
-    """The impulses of each contact: both normals together, then friction with what they press."""
+    """The impulses of each contact: friction, then both normals together, in turns."""
     own, first, second, *matrix = contacts.coupling
     there = [is_point & active for is_point, active in zip(contacts.is_point, demand.active, strict=True)]
-    inverse = 1 / jnp.where(own > 0, own, jnp.inf)
-    grip, *press = impulses
-    for _ in range(ALTERNATIONS):
-        short = [demand.speed[k] - speed[k + 1] for k in range(2)]
-        pressed = _press_both(matrix, short, press, demand.yields, there)
-        more = [new - old for new, old in zip(pressed, press, strict=True)]
-        slip = speed[0] + first * more[0] + second * more[1]
-        most = contacts.friction * (pressed[0] + pressed[1])
-        held = jnp.where(there[0] | there[1], jnp.clip(grip - slip * inverse, -most, most), 0.0)
-        changes = held - grip, *more
-        rows = (own, first, second), (first, matrix[0], matrix[1]), (second, matrix[1], matrix[2])
-        speed = map_components(lambda v, row, c=changes: v + row[0] * c[0] + row[1] * c[1] + row[2] * c[2], speed, rows)
-        grip, press = held, list(pressed)
-    return grip, press[0], press[1]
+    # what all impulses have to bring about: the speeds asked for, less those there would be without any
+    rows = (own, first, second), (first, matrix[0], matrix[1]), (second, matrix[1], matrix[2])
+    wanted = jnp.zeros_like(own), *demand.speed
+    effect = [sum(k * impulse for k, impulse in zip(row, impulses, strict=True)) for row in rows]
+    slip, *targets = (asked - v + part for asked, v, part in zip(wanted, speed, effect, strict=True))
+
+    def grip(press: Points) -> Array:
+        most = contacts.friction * (press[0] + press[1])
+        held = (slip - first * press[0] - second * press[1]) / jnp.where(own > 0, own, jnp.inf)
+        return jnp.where(there[0] | there[1], jnp.clip(held, -most, most), 0.0)
+
+    def alternate(press: Points, _: None) -> tuple[Points, None]:
+        friction = grip(press)
+        left = targets[0] - first * friction, targets[1] - second * friction
+        return _press_both(matrix, left, demand.yields, there), None
+
+    press, _ = lax.scan(alternate, impulses[1:], length=ALTERNATIONS)
+    return grip(press), *press
 
 
-def _press_both(
-    matrix: list[Array], short: list[Array], press: list[Array], yields: Points, there: list[Array]
-) -> Points:
-    """The normal impulses x >= 0 of two points with K x >= b, where either is met: solved exactly, as a box rocks.
+def _press_both(matrix: list[Array], wanted: Points, yields: Points, there: list[Array]) -> Points:
+    """The normal impulses x >= 0 of two points with K x >= wanted, where either is met: solved exactly, as a box rocks.
 
     K holds the changes of speed by unit impulses; softness makes its diagonal larger.
     """
     aa, ab, bb = matrix
     aa, bb = (jnp.where(own > 0, own, 1.0) for own in (aa, bb))
     soft_a, soft_b = (jnp.where(yields[k], SOFT.yielding * own, own) for k, own in enumerate((aa, bb)))
-    wanted_a = jnp.where(there[0], short[0] + aa * press[0] + ab * press[1], -1.0)
-    wanted_b = jnp.where(there[1], short[1] + bb * press[1] + ab * press[0], -1.0)
+    wanted_a, wanted_b = (jnp.where(there[k], wanted[k], -1.0) for k in range(2))
     determinant = soft_a * soft_b - ab * ab
     regular = determinant > MIN_DETERMINANT_SHARE * soft_a * soft_b
     inverse = 1 / jnp.where(regular, determinant, jnp.inf)
@@ -215,10 +218,15 @@ def _press_both(
 
 def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Impulses:
     """How fast b moves away from a along the tangent of every contact, and along its normal at both points [m/s]."""
+    return measure_several((velocity,), groups, contacts)[0]
 
-    def measure(group: tuple) -> Impulses:
+
+def measure_several(velocities: tuple[Velocity, ...], groups: Groups, contacts: Contacts) -> tuple[Impulses, ...]:
+    """The same of several velocities, with the contacts read once."""
+
+    def measure(group: tuple) -> tuple[Impulses, ...]:
         (a, b), contacts = group
-        return _find_speeds((_pick_rows(velocity, a), _pick_rows(velocity, b)), contacts)
+        return tuple(_find_speeds((_pick_rows(each, a), _pick_rows(each, b)), contacts) for each in velocities)
 
     return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
 
@@ -238,6 +246,7 @@ __all__ = [
     "Velocity",
     "build_contacts",
     "map_components",
+    "measure_several",
     "measure_speeds",
     "sum_impulses",
     "sweep_contacts",

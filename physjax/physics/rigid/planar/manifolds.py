@@ -8,6 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.backend import materialise
@@ -44,39 +45,67 @@ class Manifold(NamedTuple):
     is_point: Array
 
 
-class _Edge(NamedTuple):
-    """The ends of an edge [m], and its outward normal."""
+class _Face(NamedTuple):
+    """An edge that is touched: its first end [m], its length [m] and outward normal."""
 
     first: Vector
-    second: Vector
+    length: Array
     normal: Vector
 
 
-def find_manifolds(a: Outline, b: Outline) -> Manifold:
-    """The points at which shapes touch."""
-    from_a, from_b = _find_separation(a, b), _find_separation(b, a)
-    tolerance = PARALLEL_SHARE * _measure_size(a)
+class _Edge(NamedTuple):
+    """The ends of an edge as seen from a face [m]: how far along it, in order, and how far out of it."""
+
+    along: tuple[Array, Array]
+    out: tuple[Array, Array]
+
+
+class _Corner(NamedTuple):
+    """The end of an edge that is nearest to a face: where along the face its nearest point is, and the way there [m]."""
+
+    place: Array
+    way: Vector
+    square: Array
+
+
+class _Meeting(NamedTuple):
+    """Whether an edge and a face overlap, the normal in the face's frame (along, out), and both distances [m]."""
+
+    overlaps: Array
+    normal: Vector
+    distances: list[Array]
+
+
+def find_manifolds(t: ArrayLike, a: Outline, b: Outline) -> Manifold:
+    """The points at which shapes touch at time t [s], which only orders the work."""
     # each stage is stored: every number of a manifold would compute all of it again
-    store = partial(materialise, a.radius.ravel()[0])
-    on_a = store(lambda: jnp.max(from_a, axis=0) >= jnp.max(from_b, axis=0) - tolerance)
+    store = partial(materialise, t)
+    from_a, from_b = store(lambda: _find_separations(a, b))
+    on_a = store(lambda: _prefer_first(a, from_a, from_b))
     touched, other = _choose(on_a, a, b), _choose(on_a, b, a)
-    face = store(lambda: _pick_edge(touched, jnp.where(on_a[None], from_a, from_b)))
-    facing = -(face.normal[0][None] * other.normals[0] + face.normal[1][None] * other.normals[1])
-    edge = store(lambda: _pick_edge(other, jnp.where(other.is_edge, facing, -jnp.inf)))
-    return _orient(_touch_face(touched, other, face, edge), on_a)
+    face = store(lambda: _pick_face(touched, jnp.where(on_a[None], from_a, from_b)))
+    edge = store(lambda: _find_edge(other, face))
+    corner = store(lambda: _find_nearest_end(face, edge))
+    meeting = store(lambda: _meet_face(face, edge, corner, jnp.any(touched.is_edge, axis=0)))
+    return _orient(_list_points(face, edge, corner, meeting, (touched.radius, other.radius)), on_a)
+
+
+def _find_separations(a: Outline, b: Outline) -> tuple[Array, Array]:
+    """How far each edge of a is from what of b is deepest behind it [m], and of b from a; minus infinity without an edge."""
+    return _find_separation(a, b), _find_separation(b, a)
 
 
 def _find_separation(a: Outline, b: Outline) -> Array:
-    """How far each edge of a is from what of b is deepest behind it [m], minus infinity where there is no edge."""
     (ax, ay), (nx, ny), (bx, by) = a.corners, a.normals, b.corners
-    edges = []
-    for i in range(len(ax)):
-        heights = [nx[i] * (bx[j] - ax[i]) + ny[i] * (by[j] - ay[i]) for j in range(len(bx))]
-        lowest = heights[0]
-        for height in heights[1:]:
-            lowest = jnp.minimum(lowest, height)
-        edges.append(lowest)
-    return jnp.where(a.is_edge, jnp.stack(edges), -jnp.inf)
+    lowest = nx * (bx[0][None] - ax) + ny * (by[0][None] - ay)
+    for x, y in zip(bx[1:], by[1:], strict=True):
+        lowest = jnp.minimum(lowest, nx * (x[None] - ax) + ny * (y[None] - ay))
+    return jnp.where(a.is_edge, lowest, -jnp.inf)
+
+
+def _prefer_first(a: Outline, from_a: Array, from_b: Array) -> Array:
+    """Whether a face of a is touched rather than one of b."""
+    return jnp.max(from_a, axis=0) >= jnp.max(from_b, axis=0) - PARALLEL_SHARE * _measure_size(a)
 
 
 def _measure_size(shape: Outline) -> Array:
@@ -94,70 +123,90 @@ def _choose(flag: Array, a: Outline, b: Outline) -> Outline:
     )
 
 
-def _pick_edge(shape: Outline, score: Array) -> _Edge:
-    """The edge with the highest score; of a disc its center."""
+def _pick_face(shape: Outline, separation: Array) -> _Face:
+    """The face that is furthest out; of a disc its center."""
+    first, (sx, sy), (nx, ny) = _pick_ends(shape, separation)
+    length = jnp.maximum(nx * (sy - first[1]) - ny * (sx - first[0]), 0.0)
+    return _Face(first, length, (nx, ny))
+
+
+def _find_edge(shape: Outline, face: _Face) -> _Edge:
+    """The edge that faces a face, as seen from there; of a disc its center, twice."""
+    (nx, ny), (ox, oy) = face.normal, shape.normals
+    facing = jnp.where(shape.is_edge, -(nx[None] * ox + ny[None] * oy), -jnp.inf)
+    (one, out_one), (two, out_two) = (_see_from(face, end) for end in _pick_ends(shape, facing)[:2])
+    swap = one > two
+    choose = lambda a, b: (jnp.where(swap, b, a), jnp.where(swap, a, b))  # noqa: E731
+    return _Edge(choose(one, two), choose(out_one, out_two))
+
+
+def _pick_ends(shape: Outline, score: Array) -> tuple[Vector, Vector, Vector]:
+    """Both ends of the edge with the highest score, and its normal."""
     best = jnp.argmax(score, axis=0)
-    corners = len(score)
     # an edge after the last corner ends at the first
     last = jnp.sum(shape.is_edge, axis=0) - 1
     after = jnp.where(best >= last, 0, best + 1)
-    pick = lambda vector, index: tuple(_pick(part, index, corners) for part in vector)  # noqa: E731
-    return _Edge(pick(shape.corners, best), pick(shape.corners, after), pick(shape.normals, best))  # pyright: ignore[reportArgumentType]
+    pick = lambda vector, index: (_pick(vector[0], index), _pick(vector[1], index))  # noqa: E731
+    return pick(shape.corners, best), pick(shape.corners, after), pick(shape.normals, best)
 
 
-def _pick(rows: Array, index: Array, count: int) -> Array:
+def _pick(rows: Array, index: Array) -> Array:
     """The row of each pair: choices one after the other, which fuse where a gather would not."""
     found = rows[0]
-    for i in range(1, count):
+    for i in range(1, len(rows)):
         found = jnp.where(index == i, rows[i], found)
     return found
 
 
-def _touch_face(touched: Outline, other: Outline, face: _Edge, edge: _Edge) -> Manifold:
-    """The points of an edge that face another one, or where none does the nearest ends of the two."""
-    (nx, ny), (px, py) = face.normal, face.first
-    length = jnp.maximum(-ny * (face.second[0] - px) + nx * (face.second[1] - py), 0.0)
-    radii = touched.radius + other.radius
-    ends = [_see_from(face, end) for end in (edge.first, edge.second)]
-    swap = ends[0][0] > ends[1][0]
-    (low, low_height), (high, high_height) = (
-        tuple(jnp.where(swap, b, a) for a, b in zip(*pair, strict=True)) for pair in (ends, ends[::-1])
-    )
+def _see_from(face: _Face, point: Vector) -> Vector:
+    """A point in the frame of a face [m]: along it from its first end, and out of it."""
+    (nx, ny), x, y = face.normal, point[0] - face.first[0], point[1] - face.first[1]
+    return nx * y - ny * x, nx * x + ny * y
+
+
+def _find_nearest_end(face: _Face, edge: _Edge) -> _Corner:
+    ways = [(x - jnp.clip(x, 0.0, face.length), y) for x, y in zip(edge.along, edge.out, strict=True)]
+    squares = [x * x + y * y for x, y in ways]
+    nearer = squares[0] <= squares[1]
+    choose = lambda pair: jnp.where(nearer, *pair)  # noqa: E731
+    way = choose([x for x, _ in ways]), choose(edge.out)
+    return _Corner(jnp.clip(choose(edge.along), 0.0, face.length), way, choose(squares))
+
+
+def _meet_face(face: _Face, edge: _Edge, corner: _Corner, is_edge: Array) -> _Meeting:
+    """How an edge meets a face: along what they overlap, or where they do not, from the nearest end."""
+    (low, high), (low_out, high_out) = edge
     width = high - low
-    slope = (high_height - low_height) / jnp.where(width > SAME_POINT_SHARE * length, width, jnp.inf)
-    along = [jnp.clip(end, 0.0, length) for end in (low, high)]
-    heights = [low_height + slope * (place - low) for place in along]
-    # the end of the edge that is nearest, and the end of the face that it is beyond, if it is
-    squares = [(x - jnp.clip(x, 0.0, length)) ** 2 + y * y for x, y in ((low, low_height), (high, high_height))]
-    first = squares[0] <= squares[1]
-    place, rise, square = (jnp.where(first, a, b) for a, b in ((low, high), (low_height, high_height), squares))
-    corner = jnp.clip(place, 0.0, length)
-    is_beyond = (place != corner) & (rise > 0) & (square < jnp.minimum(heights[0], heights[1]) ** 2)
-    overlaps = (high >= 0) & (low <= length) & jnp.any(touched.is_edge, axis=0) & ~is_beyond
-    reach, far = place - corner, square > 0
-    distance = jnp.sqrt(jnp.where(far, square, 1.0))
+    slope = (high_out - low_out) / jnp.where(width > SAME_POINT_SHARE * face.length, width, jnp.inf)
+    heights = [low_out + slope * (jnp.clip(end, 0.0, face.length) - low) for end in (low, high)]
+    # the nearest end may be beyond an end of the face
+    reach, rise = corner.way
+    is_beyond = (reach != 0) & (rise > 0) & (corner.square < jnp.minimum(heights[0], heights[1]) ** 2)
+    overlaps = (high >= 0) & (low <= face.length) & is_edge & ~is_beyond
+    far = corner.square > 0
+    distance = jnp.sqrt(jnp.where(far, corner.square, 1.0))
     across, out = jnp.where(far, reach / distance, 0.0), jnp.where(far, rise / distance, 1.0)
     distance = jnp.where(far, distance, 0.0)
-    # in the frame of the face: (along, out)
-    normal_along, normal_out = jnp.where(overlaps, 0.0, across), jnp.where(overlaps, 1.0, out)
-    gaps = [jnp.where(overlaps, height, distance) - radii for height in heights]
+    normal = jnp.where(overlaps, 0.0, across), jnp.where(overlaps, 1.0, out)
+    return _Meeting(overlaps, normal, [jnp.where(overlaps, height, distance) for height in heights])
+
+
+def _list_points(face: _Face, edge: _Edge, corner: _Corner, meeting: _Meeting, radii: tuple[Array, Array]) -> Manifold:
+    """The points at which an edge meets a face, in the world."""
+    (nx, ny), (px, py), (overlaps, (along, out), distances) = face.normal, face.first, meeting
+    gaps = [distance - (radii[0] + radii[1]) for distance in distances]
+    ends = [jnp.clip(end, 0.0, face.length) for end in edge.along]
     places = [
-        (jnp.where(overlaps, end, corner) + normal_along * middle, normal_out * middle)
-        for end, middle in zip(along, (touched.radius + gap / 2 for gap in gaps), strict=True)
+        (jnp.where(overlaps, end, corner.place) + along * middle, out * middle)
+        for end, middle in zip(ends, (radii[0] + gap / 2 for gap in gaps), strict=True)
     ]
-    is_point = jnp.stack([jnp.ones_like(overlaps), overlaps & (along[1] - along[0] > SAME_POINT_SHARE * length)])
+    is_point = [jnp.ones_like(overlaps), overlaps & (ends[1] - ends[0] > SAME_POINT_SHARE * face.length)]
     points = (
         jnp.stack([px - ny * x + nx * y for x, y in places]),
         jnp.stack([py + nx * x + ny * y for x, y in places]),
     )
-    normal = nx * normal_out - ny * normal_along, ny * normal_out + nx * normal_along
-    return Manifold(normal, points, jnp.stack(gaps), is_point)
-
-
-def _see_from(face: _Edge, point: Vector) -> Vector:
-    """A point in the frame of a face [m]: along it from its first end, and out of it."""
-    (nx, ny), x, y = face.normal, point[0] - face.first[0], point[1] - face.first[1]
-    return nx * y - ny * x, nx * x + ny * y
+    normal = nx * out - ny * along, ny * out + nx * along
+    return Manifold(normal, points, jnp.stack(gaps), jnp.stack(is_point))
 
 
 def _orient(found: Manifold, on_a: Array) -> Manifold:

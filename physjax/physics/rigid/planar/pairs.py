@@ -15,13 +15,25 @@ class Groups(NamedTuple):
     """Contacts in groups: `contact`, `a` and `b` are `(groups, size)` numbers of contacts and of the rows of their bodies.
 
     Places that are left over have the number of contacts there are. Rows of `bodies` come first; each place of a group has
-    two rows after these for what does not move, so that no row comes up twice.
+    two rows after these for what does not move, so that no row comes up twice. The first `of_pairs` groups are of pairs.
     """
 
     contact: np.ndarray
     a: np.ndarray
     b: np.ndarray
     rows: int
+    of_pairs: int
+
+    @property
+    def size(self) -> int:
+        """Places in a group."""
+        return self.contact.shape[1]
+
+    @property
+    def is_contact(self) -> np.ndarray:
+        """Which places have a contact, `(groups, size)`."""
+        # of what is left over, both rows are of nothing
+        return self.a < self.rows - 2 * self.size
 
 
 def list_pairs(given: NestedArrayLike | None, bodies: int) -> np.ndarray:
@@ -49,8 +61,9 @@ def list_pairs(given: NestedArrayLike | None, bodies: int) -> np.ndarray:
 
 def group_contacts(pairs: np.ndarray, surfaces: int, bodies: int) -> Groups:
     """Groups of the contacts of pairs, followed by those of every body with each surface in turn."""
-    size = max(1, -(-bodies // 2))
+    size = max(1, -(-bodies // 2)) if len(pairs) else bodies
     grouped = _colour_pairs(pairs, size)
+    of_pairs = len(grouped)
     for surface in range(surfaces):
         numbers = [(len(pairs) + surface * bodies + body, body, -1) for body in range(bodies)]
         grouped += [numbers[i : i + size] for i in range(0, len(numbers), size)]
@@ -62,7 +75,7 @@ def group_contacts(pairs: np.ndarray, surfaces: int, bodies: int) -> Groups:
             number, first, second = members[place] if place < len(members) else (total, still, still + 1)
             contact[g, place], a[g, place] = number, first
             b[g, place] = second if second >= 0 else still
-    return Groups(contact, a, b, bodies + 2 * size)
+    return Groups(contact, a, b, bodies + 2 * size, of_pairs)
 
 
 def _colour_pairs(pairs: np.ndarray, size: int) -> list[list[tuple[int, int, int]]]:
