@@ -10,6 +10,7 @@ wrong.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -20,6 +21,7 @@ from physjax.physics.rigid.planar.impulses import (
     Impulses,
     Points,
     Velocity,
+    map_components,
     measure_speeds,
     sweep_contacts,
 )
@@ -29,6 +31,8 @@ MAX_ROUNDS = 64
 """Most rounds of a sub-step: an impact goes through a row of this many bodies."""
 MAX_SWEEPS = 256
 """Most sweeps over the contacts of a round: what is left of a hit on a high pile is for the next sub-steps."""
+MAX_SWEEPS_WITH_DERIVATIVES = 1024
+"""Most sweeps of all rounds of a sub-step of which there are derivatives."""
 REACH = 1 + 1e-4
 """Factor of the way in a sub-step within which a contact is reached: what just closes its gap bounces, and does not stop."""
 ROUNDING = 64
@@ -49,66 +53,63 @@ class Bouncing(NamedTuple):
 
 
 class _Round(NamedTuple):
-    """What has been reached so far: velocities, how fast both points of each contact open, and which must bounce."""
+    """How far the round of each world is: what its sweeps have brought about, and what they are asked for.
 
-    velocity: Velocity
-    speeds: Points
-    active: Points
-    number: Array
+    `speeds` are those with which the points have to part, and `active` says which; `round` and `sweep` are their numbers.
+    """
 
-
-class _Sweep(NamedTuple):
     velocity: Velocity
     impulses: Impulses
-    change: Array
+    speeds: Points
+    active: Points
+    round: Array
+    sweep: Array
 
 
 def resolve_impacts(
     velocity: Velocity, speeds: Points, groups: Groups, contacts: Contacts, bouncing: Bouncing
 ) -> Velocity:
-    """Velocities of all rows after the impacts; `speeds` are those of both points of each contact before [m/s]."""
-    slow = bouncing.slow[None, None]
+    """Velocities of all rows after the impacts; `speeds` are those of both points of each contact before [m/s].
 
-    def begin_round(velocity: Velocity, speeds: Points, number: Array) -> _Round:
-        rounding = _round_speed(velocity, ROUNDING)[None, None]
-        cases = zip(contacts.is_point, speeds, bouncing.reach, strict=True)
-        first, second = (there & (-v > slow + rounding) & (-v * REACH > reach) for there, v, reach in cases)
-        return _Round(velocity, speeds, (first, second), number)
-
-    def bounce(this: _Round) -> _Round:
-        rebounds = [-bouncing.restitution * v for v in this.speeds]
-        # what has closed its gap already closes it no further
-        first, second = (
-            jnp.where(back > slow, back, -jnp.maximum(reach, 0.0))
-            for back, reach in zip(rebounds, bouncing.reach, strict=True)
-        )
-        demand = Demand.hard((first, second), this.active)
-        velocity = _solve_round(this.velocity, groups, contacts, demand)
-        _, *opening = measure_speeds(velocity, groups, contacts)
-        return begin_round(velocity, (opening[0], opening[1]), this.number + 1)
-
-    def is_going(this: _Round) -> Array:
-        return jnp.any(this.active[0] | this.active[1], axis=(0, 1)) & (this.number < MAX_ROUNDS)
-
-    start = begin_round(velocity, speeds, jnp.zeros(velocity[0].shape[-1:], jnp.int32))
-    return differentiable_while_loop(is_going, bounce, start, most=MAX_ROUNDS).velocity
-
-
-def _solve_round(velocity: Velocity, groups: Groups, contacts: Contacts, demand: Demand) -> Velocity:
-    """Velocities after the contacts that are active separate with the speeds asked for; the others are not there."""
-    tolerance = _round_speed(velocity, CONVERGED)
+    One loop over sweeps, in which each world begins its next round when its sweeps have converged.
+    """
+    slow, none = bouncing.slow[None, None], jnp.zeros_like(speeds[0])
     # an impulse changes the speed of a contact by at least that much
     lightness = contacts.mass[0] + contacts.mass[1]
 
-    def sweep(carry: _Sweep) -> _Sweep:
-        velocity, impulses = sweep_contacts(carry.velocity, groups, contacts, demand, carry.impulses)
-        moved = [jnp.abs(new - old) for new, old in zip(impulses, carry.impulses, strict=True)]
-        most = jnp.maximum(jnp.maximum(moved[0], moved[1]), moved[2])
-        return _Sweep(velocity, impulses, jnp.max(lightness * most, axis=(0, 1)))
+    def find_demand(velocity: Velocity, speeds: Points) -> tuple[Points, Points]:
+        """What the next round asks for: the speeds after it, and of which points."""
+        rounding = _round_speed(velocity, ROUNDING)[None, None]
+        found = []
+        for there, v, reach in zip(contacts.is_point, speeds, bouncing.reach, strict=True):
+            back = -bouncing.restitution * v
+            # what has closed its gap already closes it no further
+            after = jnp.where(back > slow, back, -jnp.maximum(reach, 0.0))
+            found.append((after, there & (-v > slow + rounding) & (-v * REACH > reach)))
+        (first, first_acts), (second, second_acts) = found
+        return (first, second), (first_acts, second_acts)
 
-    none = jnp.zeros_like(demand.speed[0])
-    start = _Sweep(velocity, (none, none, none), jnp.full(none.shape[-1:], jnp.inf, none.dtype))
-    return differentiable_while_loop(lambda carry: carry.change > tolerance, sweep, start, most=MAX_SWEEPS).velocity
+    def sweep(this: _Round) -> _Round:
+        demand = Demand.hard(this.speeds, this.active)
+        velocity, impulses = sweep_contacts(this.velocity, groups, contacts, demand, this.impulses)
+        moved = map_components(lambda new, old: jnp.abs(new - old), impulses, this.impulses)
+        change = jnp.max(lightness * jnp.maximum(jnp.maximum(*moved[:2]), moved[2]), axis=(0, 1))
+        ends = (change <= _round_speed(velocity, CONVERGED)) | (this.sweep >= MAX_SWEEPS)
+        _, *opening = measure_speeds(velocity, groups, contacts)
+        following = find_demand(velocity, (opening[0], opening[1]))
+        begin = lambda new, old: jnp.where(ends[None, None], new, old)  # noqa: E731
+        speeds, active = jax.tree.map(begin, following, (this.speeds, this.active))
+        impulses = map_components(lambda part: begin(0.0, part), impulses)
+        return _Round(
+            velocity, impulses, speeds, active, this.round + ends.astype(jnp.int32), jnp.where(ends, 0, this.sweep + 1)
+        )
+
+    def is_going(this: _Round) -> Array:
+        return jnp.any(this.active[0] | this.active[1], axis=(0, 1)) & (this.round < MAX_ROUNDS)
+
+    zero = jnp.zeros(velocity[0].shape[-1:], jnp.int32)
+    start = _Round(velocity, (none, none, none), *find_demand(velocity, speeds), zero, zero)
+    return differentiable_while_loop(is_going, sweep, start, most=MAX_SWEEPS_WITH_DERIVATIVES).velocity
 
 
 def _round_speed(velocity: Velocity, units: int) -> Array:

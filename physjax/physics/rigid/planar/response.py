@@ -20,6 +20,7 @@ from physjax.physics.rigid.planar.impulses import (
     SOFT,
     Demand,
     Impulses,
+    Points,
     Velocity,
     map_components,
     measure_several,
@@ -106,36 +107,49 @@ def _stick(world: World, touching: Touching, slip: Array, rate: Velocity, slow: 
     )
 
 
+class _Pass(NamedTuple):
+    """What a sweep starts with, and what it is asked for."""
+
+    velocity: Velocity
+    impulses: Impulses
+    demand: Demand
+
+
 def _hold_apart(
     world: World, touching: Touching, velocities: tuple[Velocity, Velocity], held: Impulses, h: Array
 ) -> tuple[tuple[Velocity, Velocity], Impulses]:
     """The mean velocities and those at the end after contacts have acted, and what is kept of their impulses.
 
-    What is kept is by how much the impulses at the end are more than those in the mean: that is half of what a constant force
-    needs, and none of what stops a motion once, which both have in common. It is what the next sub-step starts with; its
-    impulses at the end start with those that it has found in the mean. So errors of a sweep do not feed on themselves.
+    Two passes of one and the same sweep: the first finds the mean velocities, in which gaps must not close nor overlaps
+    stay; the second those at the end, with which nothing that touches may approach. What is kept is by how much the impulses
+    at the end are more than those in the mean: that is half of what a constant force needs, and none of what stops a motion
+    once, which both have in common. It is what the next sub-step starts with; its impulses at the end start with those that
+    it has found in the mean. So errors of a sweep do not feed on themselves.
     """
     (mean, end), groups, (contacts, gap, _) = velocities, world.groups, touching
     push = sum_impulses(contacts, held, world.incidence)
+    each, still = h[None], jnp.zeros_like(gap[0])
+
+    def sweep(this: _Pass, _: None) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
+        after, pressed = sweep_contacts(world.pad_all(this.velocity), groups, contacts, this.demand, this.impulses)
+        _, *opening = measure_speeds(after, groups, contacts)
+        cases = zip(contacts.is_point, pressed[1:], gap, opening, strict=True)
+        first, second = (is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
+        after = world.cut_all(after)
+        # the impulses in the mean act on the end as well
+        ahead = map_components(lambda a, e, m, p: a + (e - m) + p, after, end, mean, push)
+        doubled = map_components(jnp.add, held, pressed)
+        following = _Pass(ahead, doubled, Demand.hard((still, still), (first, second)))
+        return following, (after, pressed, (first, second))
+
     overlaps = gap[0] <= 0, gap[1] <= 0
-    each = h[None]
     cure = [jnp.where(over, -SOFT.cure * s, -s) / each for over, s in zip(overlaps, gap, strict=True)]
-    demand = Demand((cure[0], cure[1]), overlaps, contacts.is_point)
-    moves, pressed = sweep_contacts(world.pad_all(map_components(jnp.add, mean, push)), groups, contacts, demand, held)
-    _, *opening = measure_speeds(moves, groups, contacts)
-    cases = zip(contacts.is_point, pressed[1:], gap, opening, strict=True)
-    first, second = (is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
-    moves = world.cut_all(moves)
-    # the impulses in the mean act on the end as well
-    end = map_components(lambda e, p, after, before: e + p + (after - before), end, push, moves, mean)
-    still = jnp.zeros_like(gap[0])
-    demand = Demand.hard((still, still), (first, second))
-    stops, stopped = sweep_contacts(
-        world.pad_all(end), groups, contacts, demand, map_components(jnp.add, held, pressed)
-    )
-    stays = first | second, first, second
-    left = map_components(lambda stay, stop, press: jnp.where(stay, stop - press, 0.0), stays, stopped, pressed)
-    return (moves, world.cut_all(stops)), left
+    start = _Pass(map_components(jnp.add, mean, push), held, Demand((cure[0], cure[1]), overlaps, contacts.is_point))
+    _, (rates, impulses, touches) = lax.scan(sweep, start, length=2)
+    moves, stops = (map_components(lambda part, k=k: part[k], rates) for k in range(2))
+    first, second = (active[0] for active in touches)
+    keep = lambda stay, impulse: jnp.where(stay, impulse[1] - impulse[0], 0.0)  # noqa: E731
+    return (moves, stops), map_components(keep, (first | second, first, second), impulses)
 
 
 def _bounce(
