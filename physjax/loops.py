@@ -297,6 +297,8 @@ def open_closure(function: Callable, *examples: PyTree) -> tuple[Callable, list]
 def _repeat_while(going: Callable, turn: Callable, start: T, most: int) -> T:
     """At most as many turns in two nested scans, those after the last that is needed left out."""
     length = math.isqrt(most - 1) + 1
+    # what a turn computes is not kept either: what keeps it is most of a program
+    turn = jax.checkpoint(turn, prevent_cse=False)
 
     def go_on(carry: T, turn: Callable) -> T:
         return lax.cond(any_lane(going(carry)), turn, lambda carry: carry, carry)

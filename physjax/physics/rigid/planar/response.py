@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
@@ -63,7 +64,7 @@ def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scen
         return _take_substep(world, scene, (state, moved), impulses, to_float_time(start), h), None
 
     begun, substeps = (scene.state, (across, first, second)), jnp.arange(solids.substeps, dtype=jnp.int32)
-    (state, impulses), _ = lax.scan(take, begun, substeps)
+    (state, impulses), _ = lax.scan(jax.checkpoint(take, prevent_cse=False), begun, substeps)
     after = jnp.moveaxis(jnp.stack(impulses), -1, 0).reshape(solids.impulses.shape)
     contacts = list(scene.contacts)
     contacts[number] = eqx.tree_at(lambda solids: solids.impulses, solids, after)
