@@ -138,7 +138,7 @@ def _take_substep(
     """What a sub-step carries on, given the state at its start and where the method alone would bring it."""
     # the step of each world, as a row
     h = jnp.broadcast_to(h.reshape(1, -1), (1, world.mass.shape[-1]))
-    start, moved = (_read_pose(state, scene) for state in states)
+    start, moved = (read_pose(state, scene) for state in states)
     touching = _find_contacts(world, start, t)
     free = mean, end = map_components(lambda a, b: (b - a) / h, start.place, moved.place), moved.rate
     changes = [jnp.max(jnp.abs(after - now), axis=0) for now, after in zip(start.rate[:2], end[:2], strict=True)]
@@ -217,7 +217,8 @@ def _cut(world: World, velocity: Velocity) -> Velocity:
     return map_components(lambda part: part[: world.size], velocity)
 
 
-def _read_pose(state: PlanarBodies, scene: Scene) -> Pose:
+def read_pose(state: PlanarBodies, scene: Scene) -> Pose:
+    """Where the bodies of a scene are in a state, and how fast they move."""
     bodies = state.lanes[-1]
     by_body = lambda number: number.reshape(-1, bodies).T  # noqa: E731
     mass, moment = (jnp.broadcast_to(number, state.lanes) for number in (scene.mass.mass, scene.mass.moment))
@@ -247,9 +248,9 @@ def _write_pose(state: PlanarBodies, places: Velocity, rates: Velocity, scene: S
 def _find_contacts(world: World, pose: Pose, t: ArrayLike) -> _Touching:
     """All contacts, first those of pairs and then those with each surface, in groups."""
     solids, groups, dtype = world.solids, world.groups, world.mass.dtype
-    outlines = materialise(t, lambda: _place_shapes(solids, pose, dtype))
+    outlines = materialise(t, lambda: place_shapes(solids, pose, dtype))
     a, b = np.array(solids.pairs, int).reshape(-1, 2).T
-    found = [find_manifolds(_select(outlines, a), _select(outlines, b))] if len(a) else []
+    found = [find_manifolds(select_shapes(outlines, a), select_shapes(outlines, b))] if len(a) else []
     if world.slots:
         found.append(find_surface_manifolds(world.slots, t, outlines))
 
@@ -272,7 +273,7 @@ def _find_contacts(world: World, pose: Pose, t: ArrayLike) -> _Touching:
     return _Touching(contacts, (gaps[0], gaps[1]), restitution, static)
 
 
-def _place_shapes(solids: SolidContact, pose: Pose, dtype: np.dtype) -> Outline:
+def place_shapes(solids: SolidContact, pose: Pose, dtype: np.dtype) -> Outline:
     """The shapes of all bodies in the world: `(corners, bodies, worlds)`."""
     bodies = len(pose.place[0])
     shapes = solids.shapes if len(solids.shapes) == bodies else solids.shapes * bodies
@@ -285,7 +286,8 @@ def _place_shapes(solids: SolidContact, pose: Pose, dtype: np.dtype) -> Outline:
     return Outline((cx + x[None], cy + y[None]), normals, is_edge, jnp.broadcast_to(table.radius[:, None], x.shape))
 
 
-def _select(outlines: Outline, bodies: np.ndarray) -> Outline:
+def select_shapes(outlines: Outline, bodies: np.ndarray) -> Outline:
+    """The shapes of these bodies."""
     corners, normals, is_edge, radius = outlines
     pick = lambda v: (v[0][:, bodies], v[1][:, bodies])  # noqa: E731
     return Outline(pick(corners), pick(normals), is_edge[:, bodies], radius[bodies])
@@ -326,4 +328,4 @@ def _take_groups(groups: Groups, array: Array) -> Array:
     return padded[..., jnp.asarray(groups.contact), :]
 
 
-__all__ = ["solve_contacts"]
+__all__ = ["SolidContact", "place_shapes", "read_pose", "select_shapes", "solve_contacts"]
