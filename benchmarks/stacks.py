@@ -4,8 +4,8 @@
 
 1024 stacks of ten boxes in float32 on one core, steps of 1/60 s, neighbours as pairs, each box offset by up to 2 % of its
 width: how many boxes take a step in a second, compile time apart. Then, in float64 and for 1 to 32 sub-steps: how far balls
-are off after bounces, against the closed form; how far a stack sinks; how deep bodies overlap and how much energy they
-gain in any time of a drop; and how far a box of a stack moves sideways after the first second, and how fast any is after a minute.
+are off after bounces, against the closed form; how far a stack sinks, how far a box of it moves sideways after the first
+second, and how fast any is after a minute; and in drops, how deep bodies sink into the floor and how much energy they gain.
 """
 
 import time

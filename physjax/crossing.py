@@ -7,7 +7,7 @@ moment within the step is a root along the method's own path; it moves with ever
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
 from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
-from physjax.particles import demand_particles
+from physjax.particles import Particles, view_centers
 from physjax.parts import as_module
 from physjax.roots import find_first_root
 from physjax.vectors import add_trailing_axes, norm
@@ -38,6 +38,19 @@ class Crossing(NamedTuple):
     position: Float[Array, "*lanes dim"]
     velocity: Float[Array, "*lanes dim"]
     ok: Bool[Array, "*lanes"]
+
+
+class BodyCrossing(NamedTuple):
+    """What `Crossing` says of each rigid body, by its center of mass, and its `state`; where it has none, `ok` False and NaN.
+
+    Of a number that is one for a whole scene of coupled bodies, one time for each scene, and all its bodies then.
+    """
+
+    time: Float[Array, "*scenes"]
+    position: Float[Array, "*lanes dim"]
+    velocity: Float[Array, "*lanes dim"]
+    ok: Bool[Array, "*scenes"]
+    state: Any
 
 
 class Height(eqx.Module):
@@ -62,9 +75,8 @@ class Distanced(Protocol):
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 @announce_compiling("the crossing")
-def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> Crossing:
+def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> Crossing | BodyCrossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
-    demand_particles("crossing", run.scene.state, "for bodies, record the signed distance instead")
     if direction not in (None, 1, -1):
         raise ValueError(
             f"direction: got {direction!r}, expected +1 (from negative to positive: upward), -1 (downward) or None."
@@ -72,31 +84,35 @@ def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> 
     if not isinstance(surface, Distanced):
         warn_of_recompilation("crossing", [surface])
         surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
-    return _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
+    found = _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
+    return Crossing(*found[:-1]) if isinstance(found.state, Particles) else found
 
 
 @eqx.filter_jit
-def _find_crossings(run: PyTree, surface: PyTree, way: Array) -> Crossing:
+def _find_crossings(run: PyTree, surface: PyTree, way: Array) -> BodyCrossing:
     find = lambda run: _find_run_crossings(run, surface, way)  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
         find = jax.vmap(find)
     return find(run)
 
 
-def _find_run_crossings(run: PyTree, surface: PyTree, way: Array) -> Crossing:
-    scene, signed_distance = run.scene, _get_distance_function(surface, run.scene)
-    if not (scene.couples and scene.state.lanes):  # one ball is tied to nobody, whatever its forces say
-        return _find_unit_crossings(run, signed_distance, way, lambda leaf: leaf)
+def _find_run_crossings(run: PyTree, surface: PyTree, way: Array) -> BodyCrossing:
+    scene, measure = run.scene, _build_measure(surface, run.scene)
+    scenes = len(scene.status_shape)
+    # one ball is tied to nobody, whatever its forces say; a measure of a whole scene is one for all of its bodies
+    if jax.eval_shape(measure, jnp.zeros(scene.status_shape, scene.state.dtype), scene.state).ndim == scenes:
+        return _find_unit_crossings(run, measure, way, lambda leaf: leaf)
 
     def of_node(n):
-        return _find_unit_crossings(run, lambda t, x: signed_distance(t, x)[..., n], way, lambda leaf: leaf[..., n, :])
+        at_node = lambda leaf: jnp.take(leaf, n, axis=scenes)  # noqa: E731
+        return _find_unit_crossings(run, lambda t, state: measure(t, state)[..., n], way, at_node)
 
     # a node's moment is its own, and the whole scene is stepped to it
     count = scene.state.lanes[-1]
     nodes = jnp.arange(count, dtype=jnp.int32)
     few = count <= NODES_PER_BATCH
     found = jax.vmap(of_node)(nodes) if few else lax.map(jax.checkpoint(of_node), nodes, batch_size=NODES_PER_BATCH)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(scene.status_shape)), found)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, scenes), found)
 
 
 class _CrossingStep(NamedTuple):
@@ -110,14 +126,16 @@ class _CrossingStep(NamedTuple):
 
 
 class _Replay(NamedTuple):
-    """A run to be stepped again: what changes in it at every frame, with its step and its signed distance as functions.
+    """A run to be stepped again: what changes in it at every frame, with its step, its measure and its rates as functions.
 
-    Every number has the shape of what is stepped on its own: a lane, or a scene of coupled ones.
+    `measure(t, state)` is what crosses zero, of particles their signed distance. Every number has the shape of what is
+    stepped on its own: a lane, or a scene of coupled ones.
     """
 
     frames: PyTree
     step: Callable
-    signed_distance: Callable
+    measure: Callable
+    rate: Callable
     first_step: Array
     steps_per_frame: int
     dt: Array
@@ -126,11 +144,11 @@ class _Replay(NamedTuple):
         """The replay without derivatives."""
         moving = self.take_frame(jnp.zeros(self.dt.shape, jnp.int32))
         step = _stop_closure_gradients(self.step, moving, self.moment(jnp.zeros(self.dt.shape, jnp.int32), 0), self.dt)
-        signed_distance = _stop_closure_gradients(self.signed_distance, self.dt, moving.state.position)
         return _Replay(
             lax.stop_gradient(self.frames),
             step,
-            signed_distance,
+            _stop_closure_gradients(self.measure, self.dt, moving.state),
+            _stop_closure_gradients(self.rate, self.dt, moving),
             self.first_step,
             self.steps_per_frame,
             lax.stop_gradient(self.dt),
@@ -145,15 +163,23 @@ class _Replay(NamedTuple):
         return jax.tree.map(lambda leaf: _take_frames(leaf, frame), self.frames)
 
     def measure_distance(self, t: Array, moving: PyTree) -> Array:
-        """The signed distance, zero within rounding: a lane that starts on the surface does not cross it at once."""
-        value, x = self.signed_distance(t, moving.state.position), moving.state.position
-        size = jnp.broadcast_to(norm(x), value.shape) if x.ndim == value.ndim + 1 else jnp.max(norm(x), axis=-1)
-        return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(x.dtype).eps) * size, 0.0, value)
+        """What crosses zero, zero within rounding: a lane that starts on the surface does not cross it at once."""
+        value, state = self.measure(t, moving.state), moving.state
+        size = _measure_size(state, value.ndim)
+        return jnp.where(jnp.abs(value) <= 8 * float(jnp.finfo(state.dtype).eps) * size, 0.0, value)
 
 
-def _find_unit_crossings(run: PyTree, signed_distance: Callable, way: Array, own: Callable) -> Crossing:
+def _measure_size(state: PyTree, axes: int) -> Array:
+    """How large the numbers are that a measure is computed from, with so many axes: of particles positions [m]."""
+    if isinstance(state, Particles):
+        return norm(state.position) if state.position.ndim == axes + 1 else jnp.max(norm(state.position), axis=-1)
+    largest = [jnp.max(jnp.abs(leaf), axis=tuple(range(axes, leaf.ndim))) for leaf in jax.tree.leaves(state)]
+    return jnp.max(jnp.stack(largest), axis=0)
+
+
+def _find_unit_crossings(run: PyTree, measure: Callable, way: Array, own: Callable) -> BodyCrossing:
     """The first crossing of every lane or, in a coupled scene, of the node in every scene that `own` picks."""
-    replay = _build_replay(run, signed_distance)
+    replay = _build_replay(run, measure)
     place = _find_crossing_step(replay.stop_gradients(), way)
     moving = replay.take_frame(place.frame)
 
@@ -167,21 +193,21 @@ def _find_unit_crossings(run: PyTree, signed_distance: Callable, way: Array, own
     side = jnp.where(place.before < 0, -1.0, 1.0).astype(replay.dt.dtype)
 
     def left(duration):
-        return side * replay.signed_distance(
-            to_float_time(begun + duration), replay.step(moving, begun, duration).state.position
-        )
+        return side * replay.measure(to_float_time(begun + duration), replay.step(moving, begun, duration).state)
 
     numbers, left = _hoist_closure(left, replay.dt)  # the root moves with all that the path depends on
     tolerance = 4 * float(jnp.finfo(replay.dt.dtype).eps) * replay.dt
     values = (side * place.before, side * place.after)
     search = ((jnp.zeros_like(replay.dt), replay.dt), values, place.found, tolerance)
     duration = find_first_root(lambda x, numbers: left(numbers, x), (numbers,), lax.stop_gradient(search))  # pyright: ignore[reportCallIssue]  # a custom derivative hides its signature
-    x, v = (own(leaf) for leaf in replay.step(moving, begun, duration).state)
+    reached = replay.step(moving, begun, duration).state
+    seen = view_centers(reached, run.scene.mass)
     reported = lambda leaf: jnp.where(add_trailing_axes(place.found, leaf.ndim), leaf, jnp.nan)  # noqa: E731
-    return Crossing(reported(to_float_time(begun + duration)), reported(x), reported(v), place.found)
+    x, v, state = jax.tree.map(lambda leaf: reported(own(leaf)), (seen.position, seen.velocity, reached))
+    return BodyCrossing(reported(to_float_time(begun + duration)), x, v, place.found, state)
 
 
-def _build_replay(run: PyTree, signed_distance: Callable) -> _Replay:
+def _build_replay(run: PyTree, measure: Callable) -> _Replay:
     """The run as a replay: what changes at its frames, and how it is stepped."""
     scene, film, shape = run.scene, run.film, run.scene.status_shape
     changes = scene.changing()
@@ -192,7 +218,12 @@ def _build_replay(run: PyTree, signed_distance: Callable) -> _Replay:
     def step(moving, t, dt):
         return eqx.filter(eqx.combine(moving, still).step(run.stepper, t, dt), changes)
 
-    return _Replay(frames, step, signed_distance, run.first_step, run.save_every, dt)
+    def rate(t, moving):
+        if isinstance(moving.state, Particles):
+            return Particles(moving.state.velocity, jnp.zeros_like(moving.state.velocity))
+        return eqx.combine(moving, still).rate(t, moving.state)
+
+    return _Replay(frames, step, measure, rate, run.first_step, run.save_every, dt)
 
 
 def _find_crossing_step(replay: _Replay, way: Array) -> _CrossingStep:
@@ -247,7 +278,7 @@ def _find_candidate_intervals(replay: _Replay, way: Array) -> Bool[Array, "inter
 
     def gap_and_rate(frame, moving):
         t, one = to_float_time(replay.moment(jnp.full(replay.dt.shape, frame), 0)), jnp.ones_like(replay.dt)
-        _, rate = jax.jvp(replay.signed_distance, (t, moving.state.position), (one, moving.state.velocity))
+        _, rate = jax.jvp(replay.measure, (t, moving.state), (one, replay.rate(t, moving)))
         return replay.measure_distance(t, moving), replay.steps_per_frame * replay.dt * rate
 
     numbers = jnp.arange(len(replay.frames.state.position), dtype=jnp.int32)
@@ -290,17 +321,28 @@ def _take_frames(leaf: Array, frame: Array) -> Array:
     return jnp.take_along_axis(leaf, index, axis=0)[0]
 
 
-def _get_distance_function(surface: PyTree, scene: PyTree) -> Callable:
-    """The signed distance to the surface, if it gives a number for each lane."""
-    signed_distance = surface.signed_distance if isinstance(surface, Distanced) else surface
-    t = jnp.zeros(scene.status_shape, scene.state.dtype)
-    seen = jax.eval_shape(signed_distance, t, scene.state.position)
-    if seen.shape != scene.state.lanes:
+def _build_measure(surface: PyTree, scene: PyTree) -> Callable:
+    """What crosses zero, a function of time and state, if it gives a number for each lane; of bodies also one for a scene."""
+    if isinstance(surface, Distanced):
+        measure = lambda t, state: surface.signed_distance(t, state.position)  # noqa: E731
+    elif isinstance(scene.state, Particles):
+        measure = lambda t, state: surface(t, state.position)  # noqa: E731
+    else:
+        measure = surface
+    t, lanes = jnp.zeros(scene.status_shape, scene.state.dtype), scene.state.lanes
+    seen = jax.eval_shape(measure, t, scene.state)
+    if isinstance(scene.state, Particles):
+        if seen.shape != lanes:
+            raise ValueError(
+                f"crossing: signed_distance(t, position) has the shape {seen.shape}, expected the lanes' {lanes}: "
+                "one distance [m] for each, e.g. position[..., 1] - 2.0."
+            )
+    elif seen.shape not in (lanes, scene.status_shape):
         raise ValueError(
-            f"crossing: signed_distance(t, position) has the shape {seen.shape}, expected the lanes' {scene.state.lanes}: "
-            "one distance [m] for each, e.g. position[..., 1] - 2.0."
+            f"crossing: the function (t, bodies) has the shape {seen.shape}, expected {lanes}, a number for each body, "
+            f"or {scene.status_shape}, one for each scene, e.g. bodies.position[..., 1] - 2.0."
         )
-    return signed_distance
+    return measure
 
 
 def _demand_unshared_memory(changing: PyTree, shape: tuple[int, ...]) -> None:

@@ -233,6 +233,12 @@ def demand_particles(what: str, state: object, why: str) -> None:
         raise TypeError(f"{what}: got a state of type {type(state).__name__}, expected Particles: {why}.")
 
 
+def view_centers(state: PyTree, mass: PyTree) -> Particles:
+    """Particles themselves, and those at the centers of mass of bodies."""
+    # a force that is no load sees bodies as particles
+    return state if isinstance(state, Particles) else state.view_for_force(None, mass)[0]
+
+
 def sum_terms(terms: Sequence[Array]) -> Array:
     """The sum of arrays, in order."""
     total, *others = terms

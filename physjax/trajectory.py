@@ -12,10 +12,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import concrete_or_none
-from physjax.crossing import Crossing, find_first_crossing
+from physjax.crossing import BodyCrossing, Crossing, find_first_crossing
 from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
 from physjax.loops import moment_at
-from physjax.particles import Particles, callable_name
+from physjax.particles import Particles, callable_name, view_centers
 from physjax.parts import Contact, Function, as_module, build_memory_mask, has_memory
 from physjax.scene import Scene
 
@@ -67,7 +67,7 @@ class Trajectory(eqx.Module):
         states = self._demand_states()
         if isinstance(states, Particles):
             return states.velocity
-        return states.view_for_force(None, self._demand_scene("velocity").mass)[0].velocity
+        return view_centers(states, self._demand_scene("velocity").mass).velocity
 
     @property
     def method(self) -> Callable | None:
@@ -133,7 +133,7 @@ class Trajectory(eqx.Module):
         held = "ok" if ok.all() else f"{ok.size - ok.sum()} of {ok.size} blew up"
         return f"<Trajectory: {how}{len(time)} frames from t = {time.min():g} to {time.max():g} s, {shape}, {held}>"
 
-    def crossing(self, surface: PyTree, *, direction: int | None = None) -> Crossing:
+    def crossing(self, surface: PyTree, *, direction: int | None = None) -> Crossing | BodyCrossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
 
         `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
@@ -146,6 +146,11 @@ class Trajectory(eqx.Module):
         its return within one step are not seen, nor are those between two frames whose positions and velocities, by the
         cubic through them, do not tell of it. Coupled nodes have their own moments each, at the cost of a few steps of
         the whole scene for every node. Raises ValueError where the run does not know its scene and method.
+
+        Of rigid bodies, heights and surfaces are crossed by their centers of mass, and a function is one of `(t, bodies)`,
+        of anything in their state: a number for each body, or, where bodies are coupled, one for all, such as an angle
+        between two. The result holds the time and the state. Where `rigid.Solids` or others bounce within the very step of
+        the crossing, the error is of first order in dt.
 
         Example:
             >>> landing = flight.crossing(0.0, direction=-1)

@@ -129,7 +129,7 @@ def dominoes(count: int = 30, push: float = 1.0, g: float = 9.8) -> Problem:
 
 @scene
 def marble_run(slope: float = 0.2, g: float = 9.8) -> Problem:
-    """Two marbles roll down three ramps: on the first at 2/3 g sin θ, as a disc does that rolls without slipping."""
+    """Two marbles roll down three ramps between walls: on the first at 2/3 g sin θ, as a disc does that does not slip."""
     radius, length, thick, drop = 0.1, 2.0, 0.1, 0.9
     tilt = slope * np.array([-1.0, 1.0, -1.0])
     ramps = np.stack([0.45 * np.array([-1.0, 1.0, -1.0]), -drop * np.arange(3)], axis=-1)
@@ -142,12 +142,14 @@ def marble_run(slope: float = 0.2, g: float = 9.8) -> Problem:
     rough = contacts.Coulomb(0.6, 0.6)
     ground = -drop * 2 - 0.8
     floor = contacts.Plane((0.0, ground), UP, restitution=0.0, coulomb=rough)
+    # a marble that is faster than a ramp is long stops at the wall and rolls back
+    walls = [contacts.Plane((-1.5 * side, 0.0), (side, 0.0), restitution=0.0) for side in (1.0, -1.0)]
     pairs = [(i, j) for j in (3, 4) for i in range(3)] + [(3, 4)]
     run = Scene(
         rigid.planar_bodies(bodies, np.concatenate([ramps, start]), np.concatenate([tilt, [0.0, 0.0]])),
         bodies,
         (forces.Gravity(g),),
-        contacts=(rigid.Solids(shapes, surfaces=(floor,), coulomb=rough, pairs=pairs),),
+        contacts=(rigid.Solids(shapes, surfaces=(floor, *walls), coulomb=rough, pairs=pairs),),
         pinned=np.arange(5) < 3,
     )
     rolls = lambda f: f.time < 0.75  # noqa: E731
@@ -155,7 +157,7 @@ def marble_run(slope: float = 0.2, g: float = 9.8) -> Problem:
     fall = lambda f: g * np.sin(slope) / 3 * f.time[rolls(f), None] ** 2  # noqa: E731
     return Problem(
         run,
-        duration=4.0,
+        duration=7.0,
         truths=(
             Truth("rolls at 2/3 g sin θ [m]", lambda f: way(f) - fall(f), 0.0, 1e-3),
             Truth(
@@ -171,7 +173,7 @@ def marble_run(slope: float = 0.2, g: float = 9.8) -> Problem:
                 1e-3,
             ),
         ),
-        frames=64,
+        frames=112,
     )
 
 

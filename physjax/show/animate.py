@@ -62,6 +62,7 @@ def bodies(
     shapes: BodyShapes | None = None,
     *,
     color: "ColorType | ArrayLike | None" = None,
+    contacts: bool = False,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
@@ -74,7 +75,7 @@ def bodies(
         11
     """
     who = "animate.bodies"
-    seen, draw = prepare_bodies(who, film, shapes, color)
+    seen, draw = prepare_bodies(who, film, shapes, color, contacts)
     frames, fps = schedule(who, seen, fps, speed)
     return Film(build_scenery(seen, frames), frames, fps, draw)
 

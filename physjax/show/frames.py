@@ -20,6 +20,7 @@ class Frames(NamedTuple):
     """One scene of a run: `time` `(frames,)` [s], `position` `(frames, nodes, dim)` [m], its contacts, and the axis `up`.
 
     The first `good_frames` can be drawn: in those all nodes are finite, or, where lanes are independent, at least one.
+    `caption` is a line below the time in each title.
     """
 
     time: np.ndarray
@@ -27,6 +28,7 @@ class Frames(NamedTuple):
     good_frames: int
     surfaces: tuple[Contact, ...]
     up: int = 1
+    caption: str = ""
 
     @property
     def blew_up(self) -> bool:
@@ -44,7 +46,8 @@ class Frames(NamedTuple):
         unit, size = ("d", DAY_SECONDS) if span > 3 * DAY_SECONDS else ("s", 1.0)
         decimals = int(np.clip(2 - np.floor(np.log10(span / size)), 0, 12))
         end = f"\nblew up after t = {self.time[self.good_frames - 1] / size:.3g} {unit}" if self.blew_up else ""
-        return f"t = {self.time[frame] / size:.{decimals}f} {unit}{end}"
+        caption = f"\n{self.caption}" if self.caption else ""
+        return f"t = {self.time[frame] / size:.{decimals}f} {unit}{caption}{end}"
 
 
 def take_frames(

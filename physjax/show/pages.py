@@ -17,8 +17,9 @@ def read_web_file(name: str) -> str:
 
 
 def fill_page(name: str, **parts: object) -> str:
-    """A template of web/ with the buttons of tools.html, and each `__PART__` replaced by its content."""
+    """A template of web/ with the buttons of tools.html and the program of data.js, each `__PART__` replaced by its content."""
     page = read_web_file(name).replace("__TOOLS__", read_web_file("tools.html"))
+    page = page.replace("__DATA__", read_web_file("data.js"))
     for part, content in parts.items():
         page = page.replace(f"__{part}__", str(content))
     return page

@@ -94,7 +94,7 @@ def arrange_panels(figure: "Figure", scenery: Scenery, count: int, bar: Callable
     """Empty axes for `count` panels; the figure becomes as high as they need."""
     rows, columns = _choose_grid(scenery, count)
     drawn = [create_axes(figure, (rows, columns, place), scenery.stage, scenery.up) for place in range(1, count + 1)]
-    lines = 1 + scenery.run.blew_up
+    lines = 1 + scenery.run.title(0).count("\n")
     for ax in drawn:
         ax.set_title(scenery.run.title(0), fontsize=10, color="0.2")
     below, above = COLOUR_BAR_INCHES * (bar is not None), TITLE_INCHES + LINE_INCHES * (lines - 1)

@@ -15,6 +15,7 @@ from physjax.physics.rigid.spatial import RigidBodies
 from physjax.show.frames import Frames, pick_frames, take_lanes
 from physjax.show.panels import build_scenery, draw_panels
 from physjax.show.planar import take_planar_bodies
+from physjax.show.planar_contacts import MarkedBodies, find_contact_marks
 from physjax.show.surfaces import draw_surface
 from physjax.trajectory import Trajectory
 
@@ -92,6 +93,7 @@ def bodies(
     frames: int | Iterable[int] | None = None,
     *,
     color: "ColorType | ArrayLike | None" = None,
+    contacts: bool = False,
     figure: "Figure | None" = None,
 ) -> "Figure":
     """Draw rigid bodies at chosen frames, side by side, each as its shape; in space shaded by Lambert's law.
@@ -99,7 +101,9 @@ def bodies(
     `shapes` is a `Shape` for all bodies or one for each: `solids.box`, `cylinder`, `capsule`, `sphere`, or
     `Shape(*meshes.read_mesh(file)).at(-center)`; without it bodies are boxes of their inertia. In the plane it is a
     `rigid.PlanarShape` or one for each, without it those of the scene's `rigid.Solids`; `color` may be a number for each,
-    and discs have a line that shows how they turn. The other arguments are as in `plot.cloth`. Returns the figure.
+    and discs have a line that shows how they turn. With `contacts` there is a dot wherever they touch, and an arrow for
+    each steady force, of which the title says the scale. The other arguments are as in `plot.cloth`. Returns the
+    figure.
 
     Example:
         >>> from physjax.show import solids
@@ -108,17 +112,28 @@ def bodies(
         2
     """
     who = "plot.bodies"
-    seen, draw = prepare_bodies(who, film, shapes, color)
+    seen, draw = prepare_bodies(who, film, shapes, color, contacts)
     chosen = pick_frames(who, seen, frames)
     return draw_panels(build_scenery(seen, chosen), chosen, draw, figure)
 
 
 def prepare_bodies(
-    who: str, film: Trajectory, shapes: BodyShapes | None, color: "ColorType | ArrayLike | None"
+    who: str,
+    film: Trajectory,
+    shapes: BodyShapes | None,
+    color: "ColorType | ArrayLike | None",
+    contacts: bool = False,
 ) -> tuple[Frames, Callable]:
     """The frames of a run with the corners of all shapes in place of the bodies, and what draws them."""
     if isinstance(film, Trajectory) and isinstance(film.state, PlanarBodies):
-        return take_planar_bodies(who, film, cast("PlanarShape | Sequence[PlanarShape] | None", shapes), color)
+        planar = cast("PlanarShape | Sequence[PlanarShape] | None", shapes)
+        seen, draw = take_planar_bodies(who, film, planar, color)
+        if not contacts:
+            return seen, draw
+        marks = find_contact_marks(who, film, seen)
+        return marks.annotate(seen), MarkedBodies(draw, marks)
+    if contacts:
+        raise ValueError(f"{who}: got contacts=True for a run in space, expected one of PlanarBodies. Leave it out.")
     seen, faces = take_bodies(who, film, cast("Shape | Sequence[Shape] | None", shapes))
     color = cast("ColorType", "#56B4E9" if color is None else color)
     return seen, partial(draw_surface, faces=faces, color=color, closed=True)

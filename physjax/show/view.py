@@ -1,6 +1,6 @@
-"""A run in space as one HTML page on which it can be turned, zoomed and played, and which fetches nothing.
+"""A run as one HTML page on which it can be turned, zoomed and played, and which fetches nothing.
 
-It is drawn by three.js (MIT, see web/vendor/), which is part of the page.
+In space it is drawn by three.js (MIT, see web/vendor/), which is part of the page; in the plane on a canvas.
 """
 
 import base64
@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from jax.typing import ArrayLike
 
+from physjax.physics.rigid.planar import PlanarBodies
 from physjax.show import obstacles
-from physjax.show.drawables import Bodies, Dots, Lines, Look, Surface, choose_drawable
+from physjax.show.drawables import Bodies, Dots, Lines, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
+from physjax.show.flat_page import describe_flat_obstacle, pack_flat_bodies, take_flat_bodies
 from physjax.show.frames import find_batch_index
 from physjax.show.page_data import (
     QUANTISATION_STEPS,
@@ -45,7 +47,7 @@ COLOUR_COUNT = 256
 
 
 class View:
-    """A page with the frames of a run, to be turned, zoomed and played. A notebook shows it; `.save("x.html")` writes it.
+    """A page with the frames of a run, to be looked at and played. A notebook shows it; `.save("x.html")` writes it.
 
     Example:
         >>> isinstance(animate.view(wave, sheet), animate.View)
@@ -63,6 +65,8 @@ class View:
     def page(self) -> str:
         """The HTML, which needs no other file."""
         data = json.dumps(self._content, separators=(",", ":")).replace("<", "\\u003c")
+        if len(self._content["low"]) == 2:
+            return fill_page("plane.html", FILM=data)
         return fill_page("view.html", THREE=_load_library(), FILM=data)
 
     def save(self, path: str | os.PathLike) -> Path:
@@ -85,27 +89,35 @@ def view(
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> View:
-    """A run in space as a page to turn, zoom, pan and play, with its surfaces, axes in metres, and up as in the scene.
+    """A run as a page to turn (in space), zoom, pan and play, with its surfaces, axes in metres, and up as in the scene.
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
-    lines coloured by strain, a `solids` shape or one for each body. Without it bodies are boxes of their inertia, nodes
-    are joined by the scene's springs, and everything else is dots with their paths. `color` is one for surfaces and
-    bodies, a value for each lane for dots. The page plays `speed` seconds of the run a second, in `fps`
+    lines coloured by strain, a `solids` shape or one for each body, in the plane a `rigid.PlanarShape`. Without it bodies
+    are boxes of their inertia or the shapes of the scene's `rigid.Solids`, nodes are joined by the scene's springs, and
+    everything else is dots with their paths. `color` is one for surfaces and bodies, a value for each lane for dots and
+    bodies in the plane. The page plays `speed` seconds of the run a second, in `fps`
     frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
-    Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; 2-D films are for
-    `animate.paths`, `animate.springs` and `animate.bodies`.
+    Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; runs in one dimension
+    are for `animate.paths`.
 
     Example:
         >>> animate.view(wave, sheet).save("wave.html").name
         'wave.html'
     """
     who = "animate.view"
-    seen = choose_drawable(who, film, shown, scene)
-    whole = seen.surface() if isinstance(seen, Bodies) else seen
-    frames, fps = schedule(who, seen.run, fps, speed)
-    scenery = build_scenery(whole.run, frames)
-    if isinstance(seen, Surface):
+    seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
+    flat = isinstance(film.state, PlanarBodies) and isinstance(seen, PlanarFigures | Dots)
+    if flat:
+        shapes = seen.shapes if isinstance(seen, PlanarFigures) else None
+        run, bodies = take_flat_bodies(who, film, shapes, color)
+    else:
+        run, bodies = (seen.surface() if isinstance(seen, Bodies) else seen).run, {}
+    frames, fps = schedule(who, run, fps, speed)
+    scenery = build_scenery(run, frames)
+    if flat:
+        part = pack_flat_bodies(bodies, scenery, frames)
+    elif isinstance(seen, Surface):
         part = _describe_surface(seen, scenery, frames, color)
     elif isinstance(seen, Bodies):
         part = _describe_bodies(seen, scenery, frames, color)
@@ -113,6 +125,7 @@ def view(
         part = _describe_lines(who, film, seen, find_batch_index(who, film, scene), scenery, frames)
     else:
         part = _describe_dots(who, cast("Dots", seen), scenery, frames, color)
+    describe = describe_flat_obstacle if scenery.flat else describe_obstacle
     return View(
         {
             "frames": frames,
@@ -127,7 +140,7 @@ def view(
             "up": scenery.up,
             "light": obstacles.LIGHT_DIRECTION.tolist(),
             "part": part,
-            "obstacles": [describe_obstacle(contact, scenery, frames) for contact in scenery.contacts],
+            "obstacles": [describe(contact, scenery, frames) for contact in scenery.contacts],
         }
     )
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Scene, animate, contacts, export, inertia, methods, plot, rigid, simulate
+from physjax import Scene, animate, contacts, export, forces, inertia, methods, plot, rigid, simulate
 from physjax.show import auto_plot
 from physjax.show.planar import build_planar_outline, choose_colours, take_planar_bodies
 
@@ -87,8 +87,33 @@ def test_a_run_draws_itself_and_is_filmed_and_exported(tmp_path):
     assert auto_plot.animate_run(FILM).save(tmp_path / "solids.html", progress=False).stat().st_size > 1000
     assert animate.bodies(FREE, fps=10).save(tmp_path / "free.gif", progress=False).stat().st_size > 1000
     assert export.gltf(FILM, tmp_path / "solids.glb", progress=False).stat().st_size > 1000
-    with pytest.raises(ValueError, match=r"animate\.bodies"):
-        animate.view(FILM)
+
+
+@pytest.fixture(scope="module")
+def resting():
+    """A disc that lies on the floor."""
+    floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0)
+    solids = rigid.Solids(SHAPES[1], surfaces=(floor,), pairs=(), substeps=1)
+    scene = Scene(rigid.planar_bodies(DISC, [[0.0, 0.5]]), DISC, (forces.Gravity(9.8),), contacts=(solids,))
+    return simulate(scene, methods.verlet, dt=0.01, steps=4)
+
+
+def test_contacts_are_dots_and_their_forces_arrows_in_a_scale_that_is_said(resting):
+    ax = plot.bodies(resting, frames=-1, contacts=True).axes[0]
+    dots, arrows = ax.collections[-2:]
+    np.testing.assert_allclose(dots.get_offsets(), [[0.0, 0.0]], atol=1e-3)
+    np.testing.assert_allclose([arrows.U, arrows.V], [[0.0], [9.8]], rtol=0.05, atol=1e-9)  # of 1 kg, onto the body
+    assert ax.get_title() == "t = 0.0400 s\narrows: 100 N per metre"
+    assert arrows.scale == 100.0  # a tenth of a metre, of a disc of 1 m
+    film = animate.bodies(resting, contacts=True, fps=100)
+    assert film.still(0).axes[0].collections[-1].U.size == 0  # before the first step
+
+
+def test_contacts_of_what_has_none_are_refused():
+    with pytest.raises(ValueError, match=r"without rigid\.Solids or without a step"):
+        plot.bodies(FREE, contacts=True)
+    with pytest.raises(ValueError, match="without a step"):
+        plot.bodies(dataclasses.replace(FILM, dt=None), contacts=True)
 
 
 def test_worlds_side_by_side_are_drawn_together():

@@ -148,8 +148,9 @@ def test_a_run_that_blew_up_ends_at_its_last_good_frame(burst):
 @pytest.mark.usefixtures("unannotated")
 def test_what_does_not_fit_is_refused_in_plain_words(drape, swarm, tmp_path):
     run, sheet = drape
-    with pytest.raises(ValueError, match="got positions with 2 components, expected 3"):
-        animate.view(swarm)
+    line = simulate(Scene(Particles(jnp.zeros((2, 1)), jnp.ones((2, 1)))), methods.verlet, dt=0.1, steps=2)
+    with pytest.raises(ValueError, match="got positions with 1 component, expected 2 or 3"):
+        animate.view(line)
     with pytest.raises(TypeError, match=r"animate.view: got str, expected springs.Springs or a lattice"):
         animate.view(run, "cloth")
     with pytest.raises(TypeError, match="expected RigidBodies"):
@@ -172,4 +173,6 @@ def test_the_page_s_program_is_shipped_with_the_package():
     listed = "from importlib.resources import files; w = files('physjax.show') / 'web'; "
     program = listed + "print(*sorted(f.name for f in w.iterdir()), *sorted(f.name for f in (w / 'vendor').iterdir()))"
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert {"view.html", "film.html", "tools.html", "three.min.js", "three.LICENSE"} <= set(run.stdout.split())
+    assert {"view.html", "plane.html", "film.html", "tools.html", "data.js", "three.min.js", "three.LICENSE"} <= set(
+        run.stdout.split()
+    )

@@ -29,7 +29,15 @@ from physjax.physics.rigid.loads import (
     on_bodies,
 )
 from physjax.physics.rigid.pairs import Balls
-from physjax.physics.rigid.planar import PlanarBodies, PlanarInertia, PlanarShape, Solids, planar_bodies
+from physjax.physics.rigid.planar import (
+    PlanarBodies,
+    PlanarContacts,
+    PlanarInertia,
+    PlanarShape,
+    Solids,
+    find_planar_contacts,
+    planar_bodies,
+)
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench
 from physjax.physics.rigid.surface_contact import Hull, SurfaceContact, Touch
 
@@ -41,6 +49,7 @@ __all__ = [
     "Joints",
     "Load",
     "PlanarBodies",
+    "PlanarContacts",
     "PlanarInertia",
     "PlanarShape",
     "RigidBodies",
@@ -54,6 +63,7 @@ __all__ = [
     "angular_acceleration",
     "angular_velocity",
     "bodies",
+    "find_planar_contacts",
     "hinge",
     "on_bodies",
     "planar_bodies",

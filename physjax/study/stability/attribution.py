@@ -12,6 +12,7 @@ from physjax.parts import Force
 from physjax.physics.springs.springs import Springs
 from physjax.scene import Scene
 from physjax.study.stability.linearisation import SmallMotion
+from physjax.study.stability.planar import strip_angles
 
 
 class Attribution(NamedTuple):
@@ -42,7 +43,9 @@ def attribute_mode(
     force = scene.forces[int(np.argmax([abs(share[kind]) for share in shares]))]
     size = np.sum(np.abs(moved) ** 2, axis=-1)
     node = tuple(int(i) for i in np.unravel_index(np.argmax(size), size.shape))
-    spring = _find_worst_spring(force, state, moved, kind, block) if isinstance(force, Springs) else None
+    load, seen = strip_angles(force, state)
+    moved = moved[..., : seen.position.shape[-1]]
+    spring = _find_worst_spring(load, seen, moved, kind, block) if isinstance(load, Springs) else None
     return Attribution(("stiffness", "damping")[kind], callable_name(force), spring, node, complex(rate))
 
 

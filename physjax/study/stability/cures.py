@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from physjax.particles import Particles
 from physjax.scene import Scene
 from physjax.stepping.implicit import ImplicitMethod
 from physjax.stepping.methods import METHODS
 from physjax.stepping.registry import read_promises
 from physjax.study.stability.limits import Limit, limit
+from physjax.study.stability.planar import State
 from physjax.text import format_seconds
 
 EVALUATIONS_PER_SOLVE = 20
@@ -20,16 +20,16 @@ RESOLVED_RATE_STEP = 0.1
 """|λ| dt with which a motion is followed to about a percent."""
 
 
-def list_resolution_cures(dt: float, fastest: Limit) -> tuple[str, ...]:
-    """Shorter steps everywhere, or where the motion is fast."""
-    finer = RESOLVED_RATE_STEP / abs(fastest.rate)
+def list_resolution_cures(dt: float, fastest: Limit, substeps: int) -> tuple[str, ...]:
+    """Shorter steps everywhere, or where the motion is fast; each step is so many of the method's."""
+    finer = substeps * RESOLVED_RATE_STEP / abs(fastest.rate)
     return (
         f"dt = {format_seconds(finer)}, {dt / finer:.3g} times the cost",
         "methods.adaptive, short steps where it is fast",
     )
 
 
-def list_cures(scene: Scene, method: Callable, dt: float, worst: Limit, state: Particles) -> tuple[str, ...]:
+def list_cures(scene: Scene, method: Callable, dt: float, worst: Limit, state: State) -> tuple[str, ...]:
     """A shorter step of the same method, and the method that needs the fewest evaluations."""
     cures = []
     promised = read_promises(method)

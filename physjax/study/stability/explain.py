@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -10,7 +11,8 @@ from jaxtyping import Array
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.compiling import announce_compiling
-from physjax.particles import Particles, demand_particles
+from physjax.particles import demand_particles, view_centers
+from physjax.physics.rigid.planar import PlanarBodies
 from physjax.scene import Scene
 from physjax.select import select_lane
 from physjax.stepping.adaptive import Adaptive
@@ -18,6 +20,7 @@ from physjax.stepping.simulate import simulate
 from physjax.study.stability.cures import list_cures, list_resolution_cures
 from physjax.study.stability.limits import growth, limit
 from physjax.study.stability.linearisation import rate_text
+from physjax.study.stability.planar import State, count_substeps
 from physjax.text import format_seconds
 from physjax.trajectory import Trajectory
 
@@ -123,7 +126,8 @@ def explain(
         run = simulate(run, method, dt=dt, steps=steps, save_every=every)
     if not isinstance(run, Trajectory) or run.scene is None or run.stepper is None or run.state is None:
         raise TypeError(_INCOMPLETE_RUN)
-    demand_particles("explain", run.scene.state, "what turns is not linearised")
+    if not isinstance(run.scene.state, PlanarBodies):
+        demand_particles("explain", run.scene.state, "what turns in space is not linearised")
     return _explain_run(run)
 
 
@@ -183,9 +187,10 @@ def _check_rates(run: Trajectory, sound: Explanation) -> Explanation:
             cures=list_cures(scene, method, step, worst, state),
         )
     t, fastest, _ = max(found, key=lambda moment: abs(moment[1].rate))
-    if abs(fastest.rate) * step <= MAX_RESOLVED_RATE_STEP:
+    substeps = count_substeps(scene)
+    if abs(fastest.rate) * step / substeps <= MAX_RESOLVED_RATE_STEP:
         return sound
-    cures = list_resolution_cures(step, fastest)
+    cures = list_resolution_cures(step, fastest, substeps)
     return sound._replace(
         cause="resolution", force=fastest.force, rate=fastest.rate, t=t, limit=fastest.dt, cures=cures
     )
@@ -249,15 +254,15 @@ def _find_first_failure(run: Trajectory) -> tuple[int, tuple[int, ...]]:
     before = scene.state
     if first > int(run.first_step) + 1:
         flight = simulate(scene, _read_method(run), dt=dt, steps=first - int(run.first_step) - 1, record=_record_state)
-        before = Particles(*(leaf[-1] for leaf in flight.recorded))
-    speed = np.abs(np.asarray(before.velocity, float)).max(axis=-1)
+        before = jax.tree.map(lambda leaf: leaf[-1], flight.recorded)
+    speed = np.abs(np.asarray(view_centers(before, scene.mass).velocity, float)).max(axis=-1)
     return first, tuple(int(i) for i in np.unravel_index(np.argmax(speed), speed.shape))
 
 
 def _fails_in_contact(run: Trajectory, first: int) -> bool:
-    """Whether the first bad step is finite without the contacts."""
+    """Whether the first bad step is finite without the contacts; solids, which wait for no contact, never fail so."""
     scene, dt = _read_scene(run), _read_dt(run)
-    if first < 0 or not scene.contacts:
+    if first < 0 or not scene.contacts or isinstance(scene.state, PlanarBodies):
         return False
     before = first - int(run.first_step) - 1
     if before:
@@ -269,23 +274,23 @@ def _fails_in_contact(run: Trajectory, first: int) -> bool:
     return bool(jnp.all(scene.finite(after.state)))
 
 
-def _record_state(t: ArrayLike, state: Particles) -> Particles:
+def _record_state(t: ArrayLike, state: State) -> State:
     return state
 
 
 def _is_step_below_rounding(scene: Scene, dt: float) -> bool:
     """Whether a hundredth of the way gone in a step is lost in the last digit of a position."""
-    x, v = (np.abs(np.asarray(leaf, float)) for leaf in scene.state)
+    x, v = (np.abs(np.asarray(leaf, float)) for leaf in view_centers(scene.state, scene.mass))
     spacing = float(jnp.finfo(scene.state.dtype).eps) * x
     moving = v > 0
     return bool(np.any(moving & (spacing > LOST_STEP_SHARE * v * dt)))
 
 
-def _pick_moments(run: Trajectory, scene: Scene) -> Iterator[tuple[float, Particles]]:
+def _pick_moments(run: Trajectory, scene: Scene) -> Iterator[tuple[float, State]]:
     """The start, and some finite frames of a run up to ten thousand times its size: time [s] and state."""
     size = LARGEST_GROWN_SIZE * max(float(np.abs(np.asarray(scene.state.position)).max()), 1.0)
     for i in np.unique(np.linspace(0, len(run.time) - 1, INSPECTED_FRAMES).astype(int)):
-        state = Particles(*(leaf[i] for leaf in run.state))
+        state = type(scene.state)(*(leaf[i] for leaf in run.state))
         if all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in state) and float(jnp.max(jnp.abs(state.position))) < size:
             yield float(np.min(np.asarray(run.time[i]))), state
 

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 
 from physjax.checks import as_real_quantity
 from physjax.compiling import announce_compiling
-from physjax.particles import Particles, callable_name
+from physjax.particles import callable_name
 from physjax.parts import as_module
 from physjax.scene import Scene
 from physjax.stepping.adaptive import Adaptive
@@ -27,6 +27,7 @@ from physjax.study.stability.linearisation import (
     rate_text,
     spectral_radius,
 )
+from physjax.study.stability.planar import State, count_substeps
 from physjax.study.stability.step_search import (
     bounded_rates,
     build_growth_filter,
@@ -114,11 +115,13 @@ def region(
 
 
 @announce_compiling("the limit")
-def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
+def limit(scene: Scene, method: Callable, at: State | None = None) -> Limit:
     """The largest stable dt of a scene under a method, predicted from its forces about a state (the start, if not given).
 
     Modes without a restoring force (a free body as a whole) and those that grow by themselves (a pendulum upside down) set
     no limit. All modes of scenes with up to 300 coordinates are considered, of larger ones the fastest; contacts are not.
+    Of bodies in the plane angles are coordinates as well. `rigid.Solids` take the method's step dt/substeps at a time: the
+    limit is that of the forces alone, as many times longer. What touches is held implicitly, and sets no limit of its own.
 
     Example:
         >>> limit = stability.limit(swing, methods.verlet)
@@ -126,6 +129,7 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
         (1.0, 'stiffness')
     """
     with jax.enable_x64(True):
+        substeps = count_substeps(scene)
         scene, state = prepare_linearisation(scene, at)
         module, name = check_method(method), callable_name(method)
         motion = linearise(scene, state)
@@ -138,30 +142,35 @@ def limit(scene: Scene, method: Callable, at: Particles | None = None) -> Limit:
         worst = np.argmax(np.where(each == each.min(), fastest, -1.0))
         block = tuple(int(i) for i in np.unravel_index(worst, each.shape))
         found = attribute_mode(scene, state, motion, block, find_worst_mode(block))
-        return Limit(name, float(each[block]), each, **found._asdict())
+        return Limit(name, substeps * float(each[block]), substeps * each, **found._asdict())
 
 
-def growth(scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None = None) -> np.ndarray:
+def growth(scene: Scene, method: Callable, dt: ArrayLike, at: State | None = None) -> np.ndarray:
     """The factor by which small motions grow in one step of dt [s]: the spectral radius of the linearised step.
 
     That of the fastest growing one, shaped like `scene.status_shape`, as `dt` may be; 1 for a stable step. Drifts are left
-    out. For methods without a stable step it predicts the growth in a run.
+    out. For methods without a stable step it predicts the growth in a run. Of `rigid.Solids` a step is all of its sub-steps.
 
     Example:
         >>> round(float(stability.growth(swing, methods.euler, 0.5)) ** 2, 3)
         2.0
     """
     with jax.enable_x64(True):
+        substeps = count_substeps(scene)
         scene, state = prepare_linearisation(scene, at)
         motion, method = linearise(scene, state), check_method(method)
-        dt = np.broadcast_to(np.asarray(as_real_quantity("dt [s]", dt, above=0.0), float), scene.status_shape)
+        dt = (
+            np.broadcast_to(np.asarray(as_real_quantity("dt [s]", dt, above=0.0), float), scene.status_shape) / substeps
+        )
         if motion.undamped or follows_rates(method):
             z = bounded_rates(motion, method) * dt[..., None]
-            return np.asarray(spectral_radius(method, jnp.asarray(z))).max(axis=-1, initial=1.0)
-        return np.maximum(1.0, compute_growths(method, motion, dt, build_growth_filter(motion)).max(axis=-1))
+            found = np.asarray(spectral_radius(method, jnp.asarray(z))).max(axis=-1, initial=1.0)
+        else:
+            found = np.maximum(1.0, compute_growths(method, motion, dt, build_growth_filter(motion)).max(axis=-1))
+        return found**substeps
 
 
-def grows_by_itself(scene: Scene, at: Particles | None = None) -> np.ndarray:
+def grows_by_itself(scene: Scene, at: State | None = None) -> np.ndarray:
     """Whether small motions about a state grow whatever the method: a pendulum upside down, bodies that pass each other.
 
     Shaped like `scene.status_shape`. There a run cannot show what the method adds.

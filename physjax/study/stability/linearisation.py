@@ -2,7 +2,7 @@
 
 About a state, a deviation d (in coordinates √m δx, which make springs symmetric) moves as d̈ = -K d - C ḋ. A method
 that steps the whole state along its rate sees nothing but the eigenvalues λ of that; one that kicks and drifts sees K
-and C themselves. Contacts are left out: they act at impacts, not in between.
+and C themselves. Contacts are left out: they act at impacts, not in between, or hold implicitly what rests.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,10 @@ from jaxtyping import Array, Complex, Float
 
 from physjax.particles import Particles, demand_particles
 from physjax.parts import Force
+from physjax.physics.rigid.planar import PlanarBodies
 from physjax.scene import Scene
 from physjax.stepping.reference import cast_floats
+from physjax.study.stability.planar import State, convert_scene
 
 MAX_DENSE_COORDINATES = 300
 """Coordinates of a scene up to which all its modes are found; of larger ones those that move fastest."""
@@ -113,22 +115,28 @@ class SmallMotion(NamedTuple):
         return np.block([[zero, one], [-self.stiffness, -self.damping]])
 
 
-def prepare_linearisation(scene: Scene, at: Particles | None) -> tuple[Scene, Particles]:
-    """A scene in float64 and the state about which its small motions are asked for: its own, if none is given."""
+def prepare_linearisation(scene: Scene, at: State | None) -> tuple[Scene, Particles]:
+    """A scene in float64 and the state about which its small motions are asked for: its own, if none is given.
+
+    Bodies in the plane are particles with three coordinates each, without contacts.
+    """
     if not isinstance(scene, Scene):
         raise TypeError(f"stability: got a {type(scene).__name__}, expected a Scene.")
     scene = cast_floats(scene, jnp.float64)
-    state = scene.state if at is None else Particles(*(jnp.asarray(a, jnp.float64) for a in at))
+    kind = type(scene.state)
+    if at is not None and len(at) != len(scene.state):
+        raise TypeError(f"at: got a state of type {type(at).__name__}, expected the scene's {kind.__name__}.")
+    state = scene.state if at is None else kind(*(jnp.asarray(a, jnp.float64) for a in at))
     if state.position.shape != scene.state.position.shape:
         raise ValueError(
             f"at: got positions of shape {state.position.shape}, expected the scene's {scene.state.position.shape}."
         )
-    return scene, state
+    return convert_scene(scene, state) if isinstance(state, PlanarBodies) else (scene, state)
 
 
 def linearise(scene: Scene, state: Particles) -> SmallMotion:
     """K and C of a scene about a state; held lanes do not move. Of large coupled scenes, their fastest modes."""
-    demand_particles("small motions", state, "what turns is not linearised")
+    demand_particles("small motions", state, "what turns in space is not linearised")
     inside = scene.state.lanes[-1:] if scene.couples else ()
     size = int(np.prod(inside)) * state.position.shape[-1]
     if size <= MAX_DENSE_COORDINATES:

@@ -29,6 +29,7 @@ from physjax.study.stability.linearisation import (
     prepare_linearisation,
     sqrt_mass,
 )
+from physjax.study.stability.planar import State, count_substeps
 from physjax.vectors import scale
 
 DEVIATION_SIZE_SHARE = 1e-10
@@ -53,7 +54,7 @@ TRIAL_STEPS = 16
 def measure_limit(
     scene: Scene,
     method: Callable,
-    at: Particles | None = None,
+    at: State | None = None,
     *,
     steps: int = 4000,
     between: tuple[float, float] | None = None,
@@ -70,8 +71,9 @@ def measure_limit(
         1.0
     """
     with jax.enable_x64(True):
+        substeps = count_substeps(scene)
         scene, state = prepare_linearisation(scene, at)
-        bottom, top = _choose_range(scene, state) if between is None else _check_range(between, scene)
+        bottom, top = _choose_range(scene, state) if between is None else _check_range(between, scene, substeps)
         low, high = bottom, top
         for _ in range(TRIAL_ROUNDS):
             tried = np.geomspace(low, high, TRIAL_STEPS)
@@ -79,12 +81,10 @@ def measure_limit(
             first = np.where(bad.any(axis=0), bad.argmax(axis=0), TRIAL_STEPS)
             pick = lambda i: np.take_along_axis(tried, np.clip(i, 0, TRIAL_STEPS - 1)[None], axis=0)[0]  # noqa: E731, B023
             low, high = pick(first - 1), pick(first)
-        return np.where(high <= bottom, 0.0, np.where(low >= top, np.inf, low))
+        return substeps * np.where(high <= bottom, 0.0, np.where(low >= top, np.inf, low))
 
 
-def grows(
-    scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None = None, *, steps: int = 4000
-) -> np.ndarray:
+def grows(scene: Scene, method: Callable, dt: ArrayLike, at: State | None = None, *, steps: int = 4000) -> np.ndarray:
     """Whether a small deviation grows in a run with steps of dt [s], for each scene (lane, where they are independent).
 
     A dt is unstable if the deviation is half as large again in the second half of the run as it ever was in the first, or
@@ -100,7 +100,7 @@ def grows(
 
 
 def measure_growth(
-    scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None = None, *, steps: int = 2000
+    scene: Scene, method: Callable, dt: ArrayLike, at: State | None = None, *, steps: int = 2000
 ) -> np.ndarray:
     """The factor by which a small deviation grows in a step of dt [s], on average over half a run; infinite if it blew up.
 
@@ -110,7 +110,7 @@ def measure_growth(
     """
     _, early, late = _measure_deviations(scene, method, dt, at, steps)
     with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(late), (late / early) ** (2 / steps), np.inf)
+        return np.where(np.isfinite(late), (late / early) ** (2 * count_substeps(scene) / steps), np.inf)
 
 
 def _choose_range(scene: Scene, state: Particles) -> tuple[np.ndarray, np.ndarray]:
@@ -124,10 +124,10 @@ def _find_fastest_rate(motion: SmallMotion) -> np.ndarray:
     return np.where(fastest > 0, fastest, 1.0)
 
 
-def _check_range(between: tuple[float, float], scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    low, high = (float(as_real_quantity("between [s]", number, above=0.0)) for number in between)
+def _check_range(between: tuple[float, float], scene: Scene, substeps: int) -> tuple[np.ndarray, np.ndarray]:
+    low, high = (float(as_real_quantity("between [s]", number, above=0.0)) / substeps for number in between)
     if low >= high:
-        raise ValueError(f"between [s]: got {low:g} and {high:g}, expected the smaller step first.")
+        raise ValueError(f"between [s]: got {between[0]:g} and {between[1]:g}, expected the smaller step first.")
     return np.full(scene.status_shape, low), np.full(scene.status_shape, high)
 
 
@@ -152,13 +152,13 @@ class _DeviationForce(Force):
 
 
 def _measure_deviations(
-    scene: Scene, method: Callable, dt: ArrayLike, at: Particles | None, steps: int
+    scene: Scene, method: Callable, dt: ArrayLike, at: State | None, steps: int
 ) -> tuple[np.ndarray, ...]:
     """The largest velocity of a deviation at the beginning, in the first and in the second half of a run."""
     steps = as_positive_integer("steps", steps, at_least=64)
     with jax.enable_x64(True):
+        dt = np.asarray(as_real_quantity("dt [s]", dt, above=0.0), float) / count_substeps(scene)
         scene, state = prepare_linearisation(scene, at)
-        dt = np.asarray(as_real_quantity("dt [s]", dt, above=0.0), float)
         status = scene.status_shape
         leading = dt.shape[: dt.ndim - len(status)] if dt.ndim > len(status) else ()
         trials = np.broadcast_to(dt, (*leading, *status)).reshape((-1, *status))

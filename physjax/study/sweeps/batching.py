@@ -32,6 +32,7 @@ FAILURE_TEXTS = {
     "Solution": "not solved: the search ended without a root",
     "Minimum": "not solved: the search ended without a minimum",
     "Crossing": "no crossing found",
+    "BodyCrossing": "no crossing found",
     "Aimed": "out of reach",
     "Shot": "out of reach",
 }

@@ -86,7 +86,7 @@ def _take_substep(
     """What a sub-step carries on, given the state at its start and where the method alone would bring it."""
     # the step of each world, as a row
     h = jnp.broadcast_to(h.reshape(1, -1), (1, world.worlds))
-    start, moved = (_read_pose(state, scene) for state in states)
+    start, moved = (read_pose(state, scene) for state in states)
     touching = find_contacts(world, start.place, t)
     free = mean, end = map_components(lambda a, b: (b - a) / h, start.place, moved.place), moved.rate
     changes = [jnp.max(jnp.abs(after - now), axis=0) for now, after in zip(start.rate[:2], end[:2], strict=True)]
@@ -135,7 +135,7 @@ def _hold_apart(
     push = sum_impulses(contacts, held, world.incidence)
     each, still = h[None], jnp.zeros_like(gap[0])
 
-    def sweep(this: _Pass, _: None) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
+    def sweep(this: _Pass, _: Any) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
         after, pressed = sweep_contacts(world.pad_all(this.velocity), groups, contacts, this.demand, this.impulses)
         _, *opening = measure_speeds(after, groups, contacts)
         cases = zip(contacts.is_point, pressed[1:], gap, opening, strict=True)
@@ -156,7 +156,7 @@ def _hold_apart(
     keep = lambda stay, impulse: jnp.where(stay, impulse[1] - impulse[0], 0.0)  # noqa: E731
     grip, *press = map_components(keep, (first | second, first, second), impulses)
     follows = jnp.where(first | second, FRICTION_LEARNED * (impulses[0][0] - held[0]), 0.0)
-    return (moves, stops), (grip + follows, *press)
+    return (moves, stops), (grip + follows, press[0], press[1])
 
 
 def _bounce(
@@ -178,7 +178,8 @@ def _bounce(
     return resolve_impacts(before, (now[0], now[1]), world.groups, touching.contacts, bouncing)
 
 
-def _read_pose(state: PlanarBodies, scene: Scene) -> Pose:
+def read_pose(state: PlanarBodies, scene: Scene) -> Pose:
+    """Where the bodies of a state of the scene are and how fast they move."""
     bodies = state.lanes[-1]
     by_body = lambda number: number.reshape(-1, bodies).T  # noqa: E731
     mass, moment = (jnp.broadcast_to(number, state.lanes) for number in (scene.mass.mass, scene.mass.moment))
@@ -202,4 +203,4 @@ def _write_pose(state: PlanarBodies, places: Velocity, rates: Velocity, scene: S
     )
 
 
-__all__ = ["solve_contacts"]
+__all__ = ["Pose", "read_pose", "solve_contacts"]

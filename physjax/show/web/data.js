@@ -1,0 +1,51 @@
+/* What the pages of animate.view have in common: how a film is unpacked, and how its axes are marked. */
+const film = JSON.parse(element("film").textContent);
+
+async function inflated(text) {
+  const bytes = Uint8Array.from(atob(text), sign => sign.charCodeAt(0));
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+}
+
+/** Whole numbers of `Kind`, in rows of `width`, from the differences of the rows; they wrap around as they did. */
+async function numbers(text, Kind, width) {
+  const array = new Kind(await inflated(text));
+  for (let i = width; i < array.length; i++) array[i] += array[i - width];
+  return array;
+}
+
+/** From metres to what is drawn: the middle of the box is the origin, its longest side is 1. */
+const middle = film.low.map((low, i) => (low + film.high[i]) / 2);
+const size = Math.max(...film.high.map((high, i) => high - film.low[i]));
+const drawn = point => point.map((x, i) => (x - middle[i]) / size);
+
+/** Places of one frame, as many components for each node as the box has; `hidden` lists nodes that are not to be seen. */
+function unpackPlaces(array, nodes) {
+  const dim = film.low.length;
+  const [low, high] = film.reach;
+  const scale = low.map((l, i) => (high[i] - l) / 2 / 32767 / size);
+  const shift = low.map((l, i) => ((l + high[i]) / 2 - middle[i]) / size);
+  const out = new Float32Array(dim * nodes), hidden = new Uint8Array(nodes);
+  return frame => {
+    const start = dim * nodes * frame;
+    for (let n = 0; n < nodes; n++) {
+      hidden[n] = array[start + dim * n] === -32768;
+      for (let i = 0; i < dim; i++) out[dim * n + i] = array[start + dim * n + i] * scale[i] + shift[i];
+    }
+    return { out, hidden };
+  };
+}
+
+/** Numbers at which an axis is marked: steps of 1, 2 or 5 times a power of ten. */
+function ticks(low, high, most) {
+  const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
+  const step = power * [1, 2, 5, 10].find(s => s * power >= rough), found = [];
+  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i++) found.push(+(i * step).toPrecision(10));
+  return found.length > 1 ? found : ticks(low, high, 2 * most);
+}
+
+/** The colours of the strains, above what is drawn. */
+function showStrainBar(part) {
+  const bar = element("bar"), limit = +part.limit.toPrecision(2), colors = part.ramp.filter((_, i) => i % 15 === 0);
+  bar.hidden = false;
+  bar.innerHTML = `<i style="background:linear-gradient(90deg,${colors.map(c => `rgb(${c})`)})"></i><span><b>\u2212${limit}</b>strain [%]<b>+${limit}</b></span>`;
+}
