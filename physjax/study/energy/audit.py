@@ -25,7 +25,8 @@ from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.response import collide, fold_body_flights
 from physjax.physics.rigid.spatial import RigidBodies
-from physjax.scene import Scene, Stage, free_motion
+from physjax.scene import Scene, free_motion
+from physjax.stages import Stage
 from physjax.stepping.reference import build_default_solver, cast_floats
 from physjax.study import energy
 from physjax.study.energy.solids import fold_solid_flights
