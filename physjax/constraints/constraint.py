@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 from physjax.checks import concrete_or_none
 from physjax.constraints.coordinates import Coordinates, Places
 from physjax.constraints.elimination import Pairs
+from physjax.loops import Time
 from physjax.parts import Force
 
 ORDERS = (2, 4)
@@ -54,13 +55,13 @@ class Constraint(Force):
         """The size of a joint [m], relative to which it is closed."""
 
     @property
-    def response(self) -> Callable:
+    def response(self) -> Callable | None:
         """How the scene's motion is kept on the joints."""
         from physjax.constraints.rattle import hold_joints
 
         return hold_joints
 
-    def constrain_rate(self, scene: PyTree, t: ArrayLike, state: PyTree, rate: PyTree) -> PyTree:
+    def constrain_rate(self, scene: PyTree, t: Time, state: PyTree, rate: PyTree) -> PyTree:
         """The rate of a state with the forces of all joints of the scene, which keep their ends together."""
         from physjax.constraints.reactions import constrain_rate
 
@@ -69,11 +70,11 @@ class Constraint(Force):
     def find_ends(self, places: Places) -> tuple[Places, Places]:
         """The places of the first and the second end of each joint, given those of the bodies `(numbers, bodies, worlds)`."""
         bodies = places.shape[1]
-        pairs = np.asarray(self.pairs)
+        pairs = np.asarray(self.pairs, np.int32)
         if (pairs < 0).any():
             world = self.world_places(places.dtype)[..., None]
             places = jnp.concatenate([places, jnp.broadcast_to(world, (*world.shape[:2], places.shape[2]))], axis=1)
-        first, second = np.where(pairs < 0, bodies - 1 - pairs, pairs).T
+        first, second = np.where(pairs < 0, np.int32(bodies - 1) - pairs, pairs).T
         return tuple(jnp.take(places, end, axis=1, mode="clip") for end in (first, second))  # pyright: ignore[reportReturnType]
 
 
@@ -81,7 +82,7 @@ def check_joint_pairs(name: str, pairs: ArrayLike | Sequence, places: int | None
     """Pairs of different bodies as tuples; below 0 are places in the world, of which there are so many (None: any number)."""
     given = np.asarray(pairs)
     if given.dtype.kind not in "iu" or given.ndim != 2 or given.shape[1:] != (2,) or not given.size:
-        raise ValueError(f"{name}: got pairs {given.tolist()}, expected (joints, 2) indices of bodies.")
+        raise ValueError(f"{name}: got pairs {given.tolist()}, expected (joints, 2) indices of different bodies.")
     if (given[:, 0] == given[:, 1]).any() or (given < 0).all(axis=1).any():
         raise ValueError(
             f"{name}: got pairs {given.tolist()}, expected two different bodies, or one and the world (-1)."

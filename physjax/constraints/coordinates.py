@@ -18,6 +18,11 @@ class Coordinates(Protocol):
     """How bodies of one kind are read and moved; a world is a scene of a batch, all of which are solved side by side."""
 
     @property
+    def dim(self) -> int:
+        """How many of the numbers of a place are a position [m], the first ones."""
+        ...
+
+    @property
     def freedoms(self) -> int:
         """In how many ways a body moves."""
         ...
@@ -67,7 +72,7 @@ class PointCoordinates:
     """Point masses: their places and velocities."""
 
     def __init__(self, dim: int):
-        self.freedoms = dim
+        self.dim = self.freedoms = dim
 
     def read_places(self, state: Particles) -> Places:
         """Positions [m]."""

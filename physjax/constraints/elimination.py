@@ -81,7 +81,7 @@ def plan_elimination(pairs: Pairs) -> Elimination:
         order += group
     number = {edge: i for i, edge in enumerate(edges)}
     levels = _pad_levels([_tabulate(group, edges, number, len(pairs)) for group in groups])
-    found = np.array(edges, int).reshape(-1, 2)
+    found = np.array(edges, np.int32).reshape(-1, 2)
     return Elimination(found, _find_shared_ends(pairs, edges), levels)
 
 
@@ -148,10 +148,12 @@ def _pad_levels(lists: list[dict]) -> tuple[Level, ...]:
     size, edges = len(lists[0]["sums"][0]) - 1, len(lists[0]["sums"][1]) - 1
 
     def pad(numbers: list[int], length: int, none: int) -> np.ndarray:
-        return np.array([*numbers, *[none] * (length - len(numbers))], int)
+        return np.array([*numbers, *[none] * (length - len(numbers))], np.int32)
 
     def build(each: dict) -> Level:
-        products = np.array([*each["products"], *[(own, own)] * (pairs - len(each["products"]))], int).reshape(-1, 2).T
+        products = (
+            np.array([*each["products"], *[(own, own)] * (pairs - len(each["products"]))], np.int32).reshape(-1, 2).T
+        )
         sums = zip(each["sums"], terms, ends, strict=True)
         on_joints, on_lower, on_upper, on_right, back = (_tabulate_sum(s, n, end) for s, n, end in sums)
         return Level(
@@ -165,7 +167,7 @@ def _pad_levels(lists: list[dict]) -> tuple[Level, ...]:
             on_upper,
             on_right,
             np.pad(back, ((0, 0), (0, width - back.shape[1])), constant_values=own),
-            np.array([width if place is None else place for place in each["places"]], int),
+            np.array([width if place is None else place for place in each["places"]], np.int32),
         )
 
     return tuple(build(each) for each in lists)
@@ -173,7 +175,7 @@ def _pad_levels(lists: list[dict]) -> tuple[Level, ...]:
 
 def _tabulate_sum(entries: Sum, terms: int, none: int) -> np.ndarray:
     """The terms of each entry as `(terms, entries)`."""
-    table = np.full((terms, len(entries)), none)
+    table = np.full((terms, len(entries)), none, np.int32)
     for i, entry in enumerate(entries):
         table[: len(entry), i] = entry
     return table
@@ -184,7 +186,7 @@ def _find_shared_ends(pairs: Pairs, edges: list[tuple[int, int]]) -> np.ndarray:
     size = len(pairs)
     ends = lambda joint: [(body, joint + side * size) for side, body in enumerate(pairs[joint]) if body >= 0]  # noqa: E731
     found = [[(p, q) for (a, p), (b, q) in product(ends(i), ends(j)) if a == b] for i, j in edges]
-    table = np.full((max(map(len, found), default=0), 2, len(edges)), 2 * size)
+    table = np.full((max(map(len, found), default=0), 2, len(edges)), 2 * size, np.int32)
     for edge, shared in enumerate(found):
         for term, both in enumerate(shared):
             table[term, :, edge] = both

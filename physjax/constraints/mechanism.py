@@ -120,8 +120,8 @@ class Mechanism(NamedTuple):
 
     def _at_ends(self, table: Array) -> Array:
         """What the bodies at both ends of each joint have; zero for the world."""
-        pairs, bodies = np.asarray(self.pairs), len(self.free)
-        index = np.where(pairs < 0, bodies, pairs).T.ravel()
+        pairs, bodies = np.asarray(self.pairs, np.int32), len(self.free)
+        index = np.where(pairs < 0, np.int32(bodies), pairs).T.ravel()
         if (pairs < 0).any():
             table = jnp.pad(table, [(0, 0)] * (table.ndim - 2) + [(0, 1), (0, 0)])
         return jnp.take(table, index, axis=-2, mode="clip")
@@ -140,9 +140,9 @@ def _contract(left: Array, right: Array) -> Array:
 @cache
 def _list_ends_of_bodies(pairs: Pairs, bodies: int) -> np.ndarray:
     """Which ends each body has, `(most, bodies)`; twice the number of joints is none."""
-    ends = np.asarray(pairs).T.ravel()
+    ends = np.asarray(pairs, np.int32).T.ravel()
     slots = [np.flatnonzero(ends == body) for body in range(bodies)]
-    table = np.full((max(map(len, slots)), bodies), len(ends))
+    table = np.full((max(map(len, slots)), bodies), len(ends), np.int32)
     for body, slot in enumerate(slots):
         table[: len(slot), body] = slot
     return table

@@ -101,7 +101,7 @@ def _begin(scene: Scene, dt: Array) -> _Start:
     jacobian = mechanism.differentiate(places)
     moved = mechanism.move_by_impulses(mechanism.coordinates.read_mobility(state, scene.mass), jacobian)
     share = max(CLOSED_SHARE, CLOSED_ROUNDINGS * float(jnp.finfo(state.dtype).eps))
-    size = jnp.max(jnp.abs(places), axis=(0, 1))
+    size = jnp.max(jnp.abs(places[: mechanism.coordinates.dim]), axis=(0, 1))
     for part in mechanism.parts:
         size = jnp.maximum(size, part.extent())
     return _Start(mechanism, jacobian, moved, jnp.broadcast_to(dt.reshape(-1), worlds), lax.stop_gradient(share * size))

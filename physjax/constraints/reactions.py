@@ -10,7 +10,7 @@ from jaxtyping import Array, PyTree
 
 from physjax.constraints.constraint import Constraint
 from physjax.constraints.mechanism import Jacobian, Mechanism, Rows
-from physjax.loops import to_float_time
+from physjax.loops import Time, to_float_time
 
 
 def stop_opening(mechanism: Mechanism, scene: PyTree, state: PyTree) -> PyTree:
@@ -22,7 +22,7 @@ def stop_opening(mechanism: Mechanism, scene: PyTree, state: PyTree) -> PyTree:
     return coordinates.push(state, mass, mechanism.sum_at_bodies(jacobian, λ))
 
 
-def constrain_rate(scene: PyTree, t: ArrayLike, state: PyTree, rate: PyTree) -> PyTree:
+def constrain_rate(scene: PyTree, t: Time, state: PyTree, rate: PyTree) -> PyTree:
     """The rate of a state with the forces of the joints: those under which the speeds at which joints open stay zero."""
     mechanism, state = _at_moment(scene, t, state)
     jacobian, λ = _find_multipliers(mechanism, scene, state, rate)
@@ -58,7 +58,7 @@ def _find_forces(scene: PyTree, t: ArrayLike, state: PyTree) -> tuple[Array, ...
     return tuple(found)
 
 
-def _at_moment(scene: PyTree, t: ArrayLike, state: PyTree) -> tuple[Mechanism, PyTree]:
+def _at_moment(scene: PyTree, t: Time, state: PyTree) -> tuple[Mechanism, PyTree]:
     """The mechanism, and the state with kinematic nodes on their path."""
     mechanism = Mechanism.of(scene)
     if scene.prescribed_motion is not None:

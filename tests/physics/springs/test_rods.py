@@ -253,7 +253,7 @@ def test_adaptive_steps_keep_rods_too():
             r"anchors of shape \(1, 3\), expected \(anchors, 2\)",
         ),
         (lambda x: springs.Rods([(1, 1)]), "expected two different bodies"),
-        (lambda x: springs.Rods([(0.5, 1)]), "indices of bodies"),
+        (lambda x: springs.Rods([(0.5, 1)]), "indices of different bodies"),
         (lambda x: springs.Rods([(0, 1)], order=3), "got order=3, expected one of"),
         (lambda x: springs.Rods([(0, 1)], substeps=0), "substeps: got 0"),
         (lambda x: springs.Rods([(-1, 0)], anchors=x[:1]), "distance between the ends of rods"),
