@@ -47,6 +47,10 @@ class Coordinates(Protocol):
         """What turns impulses into velocities, `(numbers, bodies, worlds)`."""
         ...
 
+    def measure_bodies(self, mobility: Array) -> Float[Array, "bodies worlds"]:
+        """The size of each body [m], such as its radius of gyration; zero for a point."""
+        ...
+
     def apply_mobility(self, mobility: Array, impulses: Moves) -> Moves:
         """The velocities that impulses `(freedoms, *rest)` give, where the mobility has as many axes."""
         ...
@@ -93,6 +97,10 @@ class PointCoordinates:
     def read_mobility(self, state: Particles, mass: Array) -> Array:
         """1/m [1/kg]."""
         return put_worlds_last(1 / mass, state.lanes)[None]
+
+    def measure_bodies(self, mobility: Array) -> Array:
+        """Points have no size."""
+        return jnp.zeros_like(mobility[0])
 
     def apply_mobility(self, mobility: Array, impulses: Moves) -> Moves:
         """Δv = P/m."""

@@ -99,9 +99,11 @@ def _begin(scene: Scene, dt: Array) -> _Start:
     state, worlds = scene.state, mechanism.free.shape[-1]
     places = mechanism.coordinates.read_places(state)
     jacobian = mechanism.differentiate(places)
-    moved = mechanism.move_by_impulses(mechanism.coordinates.read_mobility(state, scene.mass), jacobian)
+    mobility = mechanism.coordinates.read_mobility(state, scene.mass)
+    moved = mechanism.move_by_impulses(mobility, jacobian)
     share = max(CLOSED_SHARE, CLOSED_ROUNDINGS * float(jnp.finfo(state.dtype).eps))
     size = jnp.max(jnp.abs(places[: mechanism.coordinates.dim]), axis=(0, 1))
+    size = jnp.maximum(size, jnp.max(mechanism.coordinates.measure_bodies(mobility), axis=0))
     for part in mechanism.parts:
         size = jnp.maximum(size, part.extent())
     return _Start(mechanism, jacobian, moved, jnp.broadcast_to(dt.reshape(-1), worlds), lax.stop_gradient(share * size))

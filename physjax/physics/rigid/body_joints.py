@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -87,12 +88,32 @@ def check_joints(
     return joined, found
 
 
-def put_joints_last(numbers: Array, places: Places) -> Array:
-    """A number or a vector for each joint, `()`, `(*scenes, joints)`, with components as `(components, joints, worlds)`."""
-    _, joints, worlds = places.shape
-    if numbers.ndim < 2:
-        return jnp.broadcast_to(numbers.reshape(-1, 1), (joints, worlds))
-    return jnp.broadcast_to(numbers.reshape(-1, numbers.shape[-1]).T, (joints, worlds))
+@jax.jit
+def measure_turns(part: BodyJoints, state: PyTree) -> Array:
+    """How the second body of each joint is turned relative to the first: `(*scenes, joints)`, in space quaternions."""
+    reader = part.coordinates(state)
+    turns = reader.compare(*part.find_ends(reader.read_places(state)))
+    turns = jnp.moveaxis(turns, (0, 1, 2), (2, 1, 0)).reshape(*state.lanes[:-1], len(part.pairs), len(turns))
+    return turns[..., 0] if turns.shape[-1] == 1 else turns
+
+
+def put_joints_last(number: Array, components: int) -> Array:
+    """A number or a vector for each joint, `(*scenes, joints)` or with components last, as `(components, joints, worlds)`."""
+    own = number[..., None] if components == 1 else number
+    return jnp.moveaxis(own.reshape(-1, *own.shape[-2:]), (0, 1, 2), (2, 1, 0))
+
+
+def subtract_points(ends: Ends) -> list[Array]:
+    """From the first point of each joint to its second [m], in components."""
+    return [b - a for a, b in zip(*ends, strict=True)]
+
+
+def dot_components(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """The scalar product of vectors in components."""
+    total = a[0] * b[0]
+    for p, q in zip(a[1:], b[1:], strict=True):
+        total = total + p * q
+    return total
 
 
 def read_bodies(bodies: RigidBodies | PlanarBodies) -> Places:
@@ -102,4 +123,13 @@ def read_bodies(bodies: RigidBodies | PlanarBodies) -> Places:
     return SpatialCoordinates().read_places(bodies)
 
 
-__all__ = ["BodyJoints", "Ends", "check_joints", "put_joints_last", "read_bodies"]
+__all__ = [
+    "BodyJoints",
+    "Ends",
+    "check_joints",
+    "dot_components",
+    "measure_turns",
+    "put_joints_last",
+    "read_bodies",
+    "subtract_points",
+]

@@ -40,6 +40,10 @@ class PlanarCoordinates:
         straight, turning = (put_worlds_last(1 / number, state.lanes)[None] for number in (mass.mass, mass.moment))
         return jnp.concatenate([straight, straight, turning])
 
+    def measure_bodies(self, mobility: Array) -> Array:
+        """The radius of gyration √(I/m) [m]."""
+        return jnp.sqrt(mobility[0] / mobility[2])
+
     def apply_mobility(self, mobility: Array, impulses: Moves) -> Moves:
         """Δv = P/m and Δω = ΔL/I."""
         return mobility * impulses
@@ -64,6 +68,18 @@ class PlanarCoordinates:
         """Vectors of bodies in the world frame, in components."""
         c, s = jnp.cos(places[2]), jnp.sin(places[2])
         return [c * vectors[0] - s * vectors[1], s * vectors[0] + c * vectors[1]]
+
+    def compare(self, first: Places, second: Places) -> Array:
+        """How the second bodies are turned relative to the first [rad], `(1, joints, worlds)`."""
+        return second[2:] - first[2:]
+
+    def measure_turn(self, turn: Array, reference: Array) -> list[Array]:
+        """By which angle one turn differs from another [rad], a row."""
+        return [turn[0] - reference[0]]
+
+    def find_normals(self, axis: Array) -> list[Array]:
+        """The direction across an axis `(2, joints, 1)`."""
+        return [_normalise(jnp.stack([-axis[1], axis[0]]))]
 
 
 class SpatialCoordinates:
@@ -98,6 +114,10 @@ class SpatialCoordinates:
         parts = [put_worlds_last(inverse, state.lanes)[None], *(put_worlds_last(c, state.lanes) for c in columns)]
         return jnp.concatenate(parts)
 
+    def measure_bodies(self, mobility: Array) -> Array:
+        """The radius of gyration [m] about an axis of mean mobility."""
+        return jnp.sqrt(3.0 * mobility[0] / (mobility[1] + mobility[5] + mobility[9]))
+
     def apply_mobility(self, mobility: Array, impulses: Moves) -> Moves:
         """Δv = P/m and Δω = R I⁻¹ Rᵀ ΔL."""
         turning = mobility[1:4] * impulses[3:4] + mobility[4:7] * impulses[4:5] + mobility[7:] * impulses[5:]
@@ -122,6 +142,26 @@ class SpatialCoordinates:
         """Vectors of bodies in the world frame, in components."""
         return rotate_components(list(places[3:]), list(vectors))
 
+    def compare(self, first: Places, second: Places) -> Array:
+        """How the second bodies are turned relative to the first, as quaternions `(4, joints, worlds)`."""
+        return jnp.stack(multiply_quaternions(conjugate_quaternion(list(first[3:])), list(second[3:])))
+
+    def measure_turn(self, turn: Array, reference: Array) -> list[Array]:
+        """By which small rotation vector one turn differs from another [rad], three rows."""
+        w, *u = multiply_quaternions(list(turn), conjugate_quaternion(list(reference)))
+        # a quaternion and its opposite are one rotation
+        twice = jnp.where(w < 0, -2.0, 2.0)
+        return [twice * part for part in u]
+
+    def find_normals(self, axis: Array) -> list[Array]:
+        """Two directions across an axis `(3, joints, 1)` and each other."""
+        a = _normalise(axis)
+        smallest = jnp.argmin(jnp.abs(a), axis=0)
+        other = jnp.stack([(smallest == i).astype(a.dtype) for i in range(3)])
+        cross = lambda a, b: jnp.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])  # noqa: E731
+        first = _normalise(cross(a, other))
+        return [first, cross(a, first)]
+
 
 BodyCoordinates = PlanarCoordinates | SpatialCoordinates
 """How bodies in the plane or in space are read."""
@@ -137,6 +177,11 @@ def choose_coordinates(name: str, state: PyTree) -> BodyCoordinates:
         f"{name}: got a state of type {type(state).__name__}, expected RigidBodies or PlanarBodies. "
         "What joins particles is springs.Rods."
     )
+
+
+def _normalise(vectors: Array) -> Array:
+    """Vectors `(dim, joints, 1)` of length 1."""
+    return vectors / jnp.sqrt(jnp.sum(vectors * vectors, axis=0, keepdims=True))
 
 
 def _join(*parts: Array) -> Array:

@@ -21,7 +21,7 @@ from physjax.constraints.constraint import demand_order
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
-from physjax.physics.rigid.body_joints import BodyJoints, check_joints, read_bodies
+from physjax.physics.rigid.body_joints import BodyJoints, check_joints, read_bodies, subtract_points
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.planar.bodies import PlanarBodies
 from physjax.physics.rigid.spatial import RigidBodies, Wrench, angular_velocity
@@ -88,8 +88,7 @@ class Joints(BodyJoints):
 
     def measure(self, first: Places, second: Places) -> Float[Array, "dim joints worlds"]:
         """From the first point to the second [m]."""
-        here, there = self.place_ends(first, second)
-        return jnp.stack([b - a for a, b in zip(here, there, strict=True)])
+        return jnp.stack(subtract_points(self.place_ends(first, second)))
 
     def prepare(self, state: PyTree, mass: PyTree) -> "Joints":
         """The joints as part of a scene; exact ones are closed at its start."""

@@ -12,10 +12,10 @@ G, ROD = 9.8, inertia.planar_segment(2.0, 1.0)
 BOX = inertia.box(1.0, (0.05, 0.4, 0.05))
 
 
-def hang_rods(count=1, angle=1.0, dtype=float, **options):
+def hang_rods(count=1, angle=1.0, **options):
     """Rods of 1 m in the plane, one after the other, that hang from the origin."""
     along = np.array([np.sin(angle), -np.cos(angle)])
-    x = jnp.asarray((np.arange(count) + 0.5)[:, None] * along, dtype)
+    x = jnp.asarray((np.arange(count) + 0.5)[:, None] * along)
     points = [[[0.0, 0.0], [0.0, 0.5]], *[[[0.0, -0.5], [0.0, 0.5]]] * (count - 1)]
     joints = rigid.Joints([(i - 1, i) for i in range(count)], points, **options)
     return Scene(rigid.planar_bodies(ROD, x, angle=np.full(count, angle)), ROD, (forces.Gravity(G), joints))
@@ -36,15 +36,15 @@ def test_a_physical_pendulum_in_the_plane(order, within, ratio):
     assert found[0] / found[1] == pytest.approx(ratio, rel=0.02)
 
 
-def test_a_chain_in_the_plane_stays_closed_and_its_joints_carry_its_weight(precision):
-    scene = hang_rods(3, angle=0.0, dtype=precision.dtype)
+def test_a_chain_in_the_plane_stays_closed_and_its_joints_carry_its_weight():
+    scene = hang_rods(3, angle=0.0)
     carried = np.asarray(constraint_forces(scene)[0])
-    np.testing.assert_allclose(carried[:, 0], 0.0, atol=1e-4)
-    np.testing.assert_allclose(carried[:, 1], -2.0 * G * np.arange(3, 0, -1), rtol=1e-5)
-    scene = hang_rods(3, angle=1.0, dtype=precision.dtype)
+    np.testing.assert_allclose(carried[:, 0], 0.0, atol=1e-10)
+    np.testing.assert_allclose(carried[:, 1], -2.0 * G * np.arange(3, 0, -1), rtol=1e-10)
+    scene = hang_rods(3, angle=1.0)
     film = simulate(scene, methods.verlet, dt=1 / 240, steps=240, save_every=10)
     assert bool(film.ok)
-    assert jax.vmap(scene.forces[1].error)(film.state).max() < 64 * precision.eps + 1e-11
+    assert jax.vmap(scene.forces[1].error)(film.state).max() < 1e-11
 
 
 def test_a_conical_pendulum_in_space_turns_as_a_whole():
@@ -66,14 +66,12 @@ def test_a_conical_pendulum_in_space_turns_as_a_whole():
 
 def test_two_ball_joints_are_a_hinge_though_they_hold_a_distance_twice():
     pairs, points = rigid.hinge((-1, 0), [[0.0, 0.0, 0.0], [0.0, 0.2, 0.0]], (0.0, 0.0, 1.0), 0.1)
-    joints = rigid.Joints(pairs, points)
     place = 0.2 * np.array([[np.sin(1.0), -np.cos(1.0), 0.0]])
     start = rigid.bodies(BOX, place, orientation=[[np.cos(0.5), 0.0, 0.0, np.sin(0.5)]])
-    scene = Scene(start, BOX, (forces.Gravity(G), joints))
-    end = simulate(scene, methods.verlet, dt=2e-3, steps=250, save_every=250).final_scene.state
-    angle = swing(1.0, G * 0.2 / ((0.05**2 + 0.4**2) / 12 + 0.04), 0.5)
-    np.testing.assert_allclose(end.position[0], 0.2 * np.array([np.sin(angle), -np.cos(angle), 0.0]), atol=1e-5)
-    assert joints.error(end).max() < 1e-12
+    scene = Scene(start, BOX, (forces.Gravity(G), rigid.Joints(pairs, points)))
+    rate = jax.jit(lambda scene: scene.rate(0.0, scene.state))(scene)
+    turning = -G * 0.2 / ((0.05**2 + 0.4**2) / 12 + 0.04) * np.sin(1.0)
+    np.testing.assert_allclose(rate.momentum[0], np.cross([0.0, 0.0, turning], place[0]), atol=1e-12)
 
 
 def test_held_bodies_hold_what_is_joined_to_them():
