@@ -6,9 +6,9 @@ order of `elimination`. `reactions` are the forces of joints, and the speeds tha
 """
 
 from physjax.constraints.constraint import Constraint
-from physjax.constraints.reactions import constraint_forces
+from physjax.constraints.reactions import constraint_forces, project_joints
 
-__all__ = ["Constraint", "constraint_forces"]
+__all__ = ["Constraint", "constraint_forces", "project_joints"]
 
 
 def __dir__() -> list[str]:

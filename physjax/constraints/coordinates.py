@@ -55,6 +55,10 @@ class Coordinates(Protocol):
         """The velocities that impulses `(freedoms, *rest)` give, where the mobility has as many axes."""
         ...
 
+    def put_places(self, state: PyTree, other: PyTree) -> PyTree:
+        """The state with the places of another."""
+        ...
+
     def push(self, state: PyTree, mass: PyTree, impulses: Moves) -> PyTree:
         """The state, or a rate of states, with impulses `(freedoms, bodies, worlds)` added to the momenta."""
         ...
@@ -105,6 +109,10 @@ class PointCoordinates:
     def apply_mobility(self, mobility: Array, impulses: Moves) -> Moves:
         """Δv = P/m."""
         return mobility * impulses
+
+    def put_places(self, state: Particles, other: Particles) -> Particles:
+        """The velocities of one, the positions of the other."""
+        return state._replace(position=other.position)
 
     def push(self, state: Particles, mass: Array, impulses: Moves) -> Particles:
         """v += P/m."""

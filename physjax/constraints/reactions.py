@@ -12,6 +12,9 @@ from physjax.constraints.constraint import Constraint
 from physjax.constraints.mechanism import Jacobian, Mechanism, Rows
 from physjax.loops import Time, to_float_time
 
+PROJECTION_STEPS = 5
+"""Newton's steps of a projection: joints that are open by a tenth of their size close to rounding."""
+
 
 def stop_opening(mechanism: Mechanism, scene: PyTree, state: PyTree) -> PyTree:
     """The state with impulses along the joints after which none opens, J q̇ = 0: for what moves otherwise as it did."""
@@ -20,6 +23,28 @@ def stop_opening(mechanism: Mechanism, scene: PyTree, state: PyTree) -> PyTree:
     opening = mechanism.measure_rates(jacobian, coordinates.read_rates(state, mass))
     λ = _solve_impulses(mechanism, mass, state, jacobian, -opening)
     return coordinates.push(state, mass, mechanism.sum_at_bodies(jacobian, λ))
+
+
+def project_joints(scene: PyTree, state: PyTree) -> PyTree:
+    """The state with its joints closed and none opening, changed as little as the masses allow: for what else moves bodies.
+
+    Newton's steps, each a displacement M⁻¹Jᵀλ, then the impulses that stop the joints: a contact solver calls this after
+    it has pushed bodies apart.
+    """
+    mechanism, mass = Mechanism.of(scene), scene.mass
+    coordinates, whole = mechanism.coordinates, jnp.ones((), state.dtype)
+
+    def close(state: PyTree, _: None) -> tuple[PyTree, None]:
+        places = coordinates.read_places(state)
+        jacobian = mechanism.differentiate(places)
+        λ = _solve_impulses(mechanism, mass, state, jacobian, -mechanism.measure(places))
+        # bodies that rest, pushed and left alone for a second
+        still = state.hold_lanes(jnp.zeros(state.lanes, state.dtype))
+        moved = coordinates.push(still, mass, mechanism.sum_at_bodies(jacobian, λ)).drift(whole, mass)
+        return coordinates.put_places(state, moved), None
+
+    closed, _ = lax.scan(close, state, None, length=PROJECTION_STEPS)
+    return stop_opening(mechanism, scene, closed)
 
 
 def constrain_rate(scene: PyTree, t: Time, state: PyTree, rate: PyTree) -> PyTree:
@@ -96,4 +121,4 @@ def _solve_impulses(mechanism: Mechanism, mass: PyTree, state: PyTree, jacobian:
     return lax.custom_linear_solve(apply, right, solve, symmetric=True)
 
 
-__all__ = ["constrain_rate", "constraint_forces", "stop_opening"]
+__all__ = ["constrain_rate", "constraint_forces", "project_joints", "stop_opening"]

@@ -48,6 +48,10 @@ class PlanarCoordinates:
         """Δv = P/m and Δω = ΔL/I."""
         return mobility * impulses
 
+    def put_places(self, state: PlanarBodies, other: PlanarBodies) -> PlanarBodies:
+        """The momenta of one, the positions and angles of the other."""
+        return state._replace(position=other.position, angle=other.angle)
+
     def push(self, state: PlanarBodies, mass: PlanarInertia, impulses: Moves) -> PlanarBodies:
         """p += P and L += ΔL."""
         change = put_worlds_first(impulses, state.lanes)
@@ -122,6 +126,10 @@ class SpatialCoordinates:
         """Δv = P/m and Δω = R I⁻¹ Rᵀ ΔL."""
         turning = mobility[1:4] * impulses[3:4] + mobility[4:7] * impulses[4:5] + mobility[7:] * impulses[5:]
         return _join(mobility[:1] * impulses[:3], turning)
+
+    def put_places(self, state: RigidBodies, other: RigidBodies) -> RigidBodies:
+        """The momenta of one, the positions and orientations of the other."""
+        return state._replace(position=other.position, orientation=other.orientation)
 
     def push(self, state: RigidBodies, mass: Inertia, impulses: Moves) -> RigidBodies:
         """p += P and L += ΔL."""
