@@ -46,6 +46,7 @@ from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from physjax import projectile, scenes, show, study
+    from physjax.constraints import constraint_forces
     from physjax.physics import contacts, emitters, rigid, springs
     from physjax.physics.forces import flows as fields
     from physjax.physics.rigid import inertia
@@ -76,6 +77,7 @@ __all__ = [
     "aim_at",
     "animate",
     "cache",
+    "constraint_forces",
     "contacts",
     "emitters",
     "energy",
@@ -117,6 +119,7 @@ _LAZY = {
     "accuracy": "physjax.study.accuracy",
     "aim_at": "physjax.study.inverse.aim:aim_at",
     "animate": "physjax.show.animate",
+    "constraint_forces": "physjax.constraints:constraint_forces",
     "contacts": "physjax.physics.contacts",
     "emitters": "physjax.physics.emitters",
     "energy": "physjax.study.energy",

@@ -163,6 +163,18 @@ class Force(eqx.Module):
         return type(self).advance is not Force.advance
 
     @property
+    def response(self) -> Callable | None:
+        """How a scene's motion is kept on what the force holds exactly, as by a contact's response; None: it only pushes."""
+
+    def constrain_rate(self, scene: PyTree, t: Time, state: PyTree, rate: PyTree) -> PyTree:
+        """The rate of a state with the forces of all that the scene holds exactly."""
+        return rate
+
+    def prepare(self, state: PyTree, mass: PyTree) -> "Force":
+        """The force as part of a scene that starts in this state; what it joins is checked here."""
+        return self
+
+    @property
     def up_axis(self) -> int | None:
         """The axis that points up, of a force that has one in a field `up`."""
         axis = getattr(self, "up", None)

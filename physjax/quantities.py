@@ -54,7 +54,7 @@ class Number(NamedTuple):
             # a record of ours is shaped like the lanes; a module that declares nothing shares what it holds
             return self.owner is None and np.shape(self.value)[: len(lanes)] == lanes
         own = ENTRY_AXIS_COUNT[self.quantity.per] + len(self.quantity.axes(dim))
-        entries = self.quantity.per in (*PER_LANE, "spring", "memory")
+        entries = self.quantity.per in (*PER_LANE, "spring", "joint", "memory")
         return entries and np.ndim(self.value) > own and np.shape(self.value)[: len(lanes)] == lanes
 
     def is_vector(self, lanes: tuple[int, ...], dim: int) -> bool:

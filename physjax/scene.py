@@ -9,7 +9,7 @@ unless a force says otherwise.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -33,7 +33,6 @@ from physjax.parts import (
     Contact,
     Force,
     ParticleSource,
-    adopt_force,
     as_module,
     as_tuple,
     build_advance_mask,
@@ -51,6 +50,7 @@ from physjax.quantities import (
     mark_invalid_lanes,
     may_hide_lanes,
 )
+from physjax.stages import Stage, advance_force, prescribe, resolve_contact
 
 
 def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
@@ -128,6 +128,7 @@ class Scene(eqx.Module):
             demand_fitting_numbers(part, lanes, state.position.shape[-1])
         for contact in self.contacts:
             contact.demand_fit(state, mass)
+        self.forces = tuple(force.prepare(state, mass) for force in self.forces)
         self.state = state = mark_invalid_lanes(
             state, mass, (*self.forces, *self.contacts, pinned, emitter), self.contacts
         )
@@ -165,8 +166,8 @@ class Scene(eqx.Module):
 
     @property
     def compile_bound(self) -> bool:
-        """Whether compiling a step costs more than taking it: few lanes, and contacts timed within the step."""
-        timed = any((contact.response or project) is not project for contact in self.contacts)
+        """Whether compiling a step costs more than taking it: few lanes, and contacts timed within it, or joints."""
+        timed = bool(self.constraints) or any((c.response or project) is not project for c in self.contacts)
         return timed and math.prod(self.state.lanes) < MIN_LANES_TO_SELECT
 
     def may_be_cut(self) -> bool:
@@ -188,7 +189,13 @@ class Scene(eqx.Module):
     @property
     def only_moves(self) -> bool:
         """Whether a step is the method's alone: no contact, birth or path within it, and no memory after it."""
-        return not self.contacts and self.emitter is None and self.prescribed_motion is None and not self.remembers
+        alone = not self.contacts and self.emitter is None and self.prescribed_motion is None
+        return alone and not self.remembers and not self.constraints
+
+    @property
+    def constraints(self) -> tuple[Force, ...]:
+        """What the scene holds exactly: joints and rods."""
+        return tuple(force for force in self.forces if force.response is not None)
 
     @property
     def remembers(self) -> bool:
@@ -223,14 +230,17 @@ class Scene(eqx.Module):
 
     def acceleration(self, t: Time, state: Particles) -> Float[Array, "*lanes dim"]:
         """Newton's second law for particles, a = ΣF/m [m/s²]; held lanes do not accelerate, kinematic ones as their path does."""
-        return state.generalised_force(self, t)
+        return self.rate(t, state).velocity if self.constraints else state.generalised_force(self, t)
 
     def rate(self, t: Time, state: PyTree) -> PyTree:
         """Time derivative of the whole state: the right-hand side of the equations of motion."""
         if not self.compiles_in_pieces:
-            return state.rate(state.generalised_force(self, t), self.mass)
-        force = evaluate_coupled(to_float_time(t), lambda state: state.generalised_force(self, t), state)
-        return state.rate(force, self.mass)
+            rate = state.rate(state.generalised_force(self, t), self.mass)
+        else:
+            force = evaluate_coupled(to_float_time(t), lambda state: state.generalised_force(self, t), state)
+            rate = state.rate(force, self.mass)
+        constraints = self.constraints
+        return constraints[0].constrain_rate(self, t, state, rate) if constraints else rate
 
     def kick(self, state: PyTree, rate: PyTree, dt: ArrayLike) -> PyTree:
         """Velocities (of bodies the momenta) changed by what `rate` says for a time dt."""
@@ -286,16 +296,16 @@ class Scene(eqx.Module):
         if emitter is None:
             stages = [Stage("move", lambda scene: motion(scene, t, dt))]
             stages += [
-                Stage("resolve contacts", partial(_resolve_contact, i, t=t + dt), i)
+                Stage("resolve contacts", partial(resolve_contact, i, t=t + dt), i)
                 for i, contact in enumerate(self.contacts)
                 if (contact.response or project) is project
             ]
         else:
             stages = [Stage("move", lambda scene: emitter.live(motion, scene, t, dt))]
         if self.prescribed_motion is not None or (self.contacts and self.pinned is not None):
-            stages.append(Stage("prescribe", partial(_prescribe, start=self.state, t=t + dt)))
+            stages.append(Stage("prescribe", partial(prescribe, start=self.state, t=t + dt)))
         stages += [
-            Stage("advance memory", partial(_advance_force, i, t=to_float_time(t), dt=dt), i)
+            Stage("advance memory", partial(advance_force, i, t=to_float_time(t), dt=dt), i)
             for i, force in enumerate(self.forces)
             if force.remembers
         ]
@@ -303,7 +313,7 @@ class Scene(eqx.Module):
 
     def _motion(self, method: Callable) -> Callable:
         """The method's step within the responses of the contacts; `project` is outside of it but under an emitter."""
-        motion = Partial(free_motion, as_module(method))
+        motion = self.constrained_motion(method)
         responses = dict.fromkeys(contact.response or project for contact in self.contacts)
         # what is resolved at the end of the step comes last
         for response in sorted(responses, key=lambda response: response is project):
@@ -311,6 +321,13 @@ class Scene(eqx.Module):
                 continue
             ours = is_library_part(response)
             motion = Partial(response, motion) if ours else Partial(respond_at_float_time, as_module(response), motion)
+        return motion
+
+    def constrained_motion(self, method: Callable) -> Callable:
+        """The method's step as if nothing were in the way, kept on what the scene holds exactly."""
+        motion = Partial(free_motion, as_module(method))
+        for response in dict.fromkeys(constraint.response for constraint in self.constraints):
+            motion = Partial(response, motion)
         return motion
 
     def replace(self, **parts: PyTree) -> "Scene":
@@ -331,39 +348,6 @@ class Scene(eqx.Module):
         ]
         good = jnp.all(jnp.stack(status), axis=0)
         return jnp.all(good, axis=-1) if self.couples and good.ndim else good
-
-
-class Stage(NamedTuple):
-    """A named part of a step; `part` counts the contact or the force that it is about."""
-
-    name: str
-    run: Callable[[Scene], Scene]
-    part: int | None = None
-
-
-def _resolve_contact(index: int, scene: Scene, t: Time) -> Scene:
-    state = scene.contacts[index].resolve(to_float_time(t), scene.state, scene.mass)
-    return scene.replace(state=state)
-
-
-def _prescribe(scene: Scene, start: PyTree, t: Time) -> Scene:
-    """Kinematic nodes where their path is at the time t, held ones where they were at the start of the step."""
-    if scene.prescribed_motion is not None:
-        return scene.replace(state=scene.prescribed_motion.prescribe(to_float_time(t), scene.state))
-    held = jnp.asarray(scene.held)
-    # an angle in the plane is a number for each lane, without an axis of components
-    like = lambda leaf: held if leaf.ndim == held.ndim else held[..., None]  # noqa: E731
-    keep = lambda now, before: jnp.where(like(now), before, now)  # noqa: E731
-    return scene.replace(state=jax.tree.map(keep, scene.state, start))
-
-
-def _advance_force(index: int, scene: Scene, t: ArrayLike, dt: ArrayLike) -> Scene:
-    force, state = scene.forces[index], scene.state
-    seen, _ = state.view_for_force(force, scene.mass)
-    force, after = force.advance(t, dt, seen)
-    forces = (*scene.forces[:index], adopt_force(force), *scene.forces[index + 1 :])
-    # a force that sees no state of this kind, such as one at the centres of bodies, cannot change it
-    return scene.replace(state=after if seen is state else state, forces=forces)
 
 
 @runtime_checkable

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from physjax.physics.rigid.planar import PlanarBodies
 from physjax.physics.rigid.spatial import RigidBodies
+from physjax.physics.springs.rods import Rods
 from physjax.physics.springs.springs import Springs
 from physjax.scenes.registry import SCENES, title
 from physjax.study.problem import Problem
@@ -126,15 +127,16 @@ def _draw_scene(name: str, folder: Path) -> Entry:
 
 
 def _describe_size(problem: Problem) -> str:
-    """The number of particles or bodies, of dimensions and of springs, and the duration."""
+    """The number of particles or bodies, of dimensions, of springs and of rods, and the duration."""
     from physjax.text import format_seconds
 
     state, forces = problem.scene.state, problem.scene.forces
     lanes = state.position[..., 0].size
     one, many = ("body", "bodies") if isinstance(state, RigidBodies | PlanarBodies) else ("particle", "particles")
-    words = f"{lanes} {one if lanes == 1 else many}"
-    springs = sum(len(force.pairs) for force in forces if isinstance(force, Springs))
-    joined = f", {springs} spring{'s' * (springs > 1)}" if springs else ""
+    words, joined = f"{lanes} {one if lanes == 1 else many}", ""
+    for kind, word in ((Springs, "spring"), (Rods, "rod")):
+        number = sum(len(force.pairs) for force in forces if isinstance(force, kind))
+        joined += f", {number} {word}{'s' * (number > 1)}" if number else ""
     return f"{words} in {state.position.shape[-1]}-D{joined}, {format_seconds(problem.duration)}"
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from physjax.physics.springs.assembly import Lattice
+from physjax.physics.springs.rods import Rods
 from physjax.physics.springs.springs import Springs
 from physjax.show.frames import Frames, find_batch_index, find_intact_springs, get_springs, pick_frames, take_frames
 from physjax.show.panels import Scenery, build_scenery, draw_colour_bar, draw_panels
@@ -27,6 +28,8 @@ MAX_BLOWN_UP_STRAIN = 1.0
 """The largest strain that has a colour in a run that blew up: a spring of twice its length."""
 MIN_STRAIN_LIMIT = 0.01
 """The largest strain that has a colour where no spring is stretched at all."""
+ROUNDING_STRAIN = 1e-8
+"""A strain below this is rounding, as that of rods: it has no colour."""
 
 
 class SpringLines(NamedTuple):
@@ -58,7 +61,7 @@ class SpringLines(NamedTuple):
 
 def springs(
     film: Trajectory,
-    sheet: Lattice | Springs,
+    sheet: Lattice | Springs | Rods,
     frames: int | Iterable[int] | None = None,
     *,
     scene: int | Sequence[int] | None = None,
@@ -67,8 +70,9 @@ def springs(
 ) -> "Figure":
     """Draw springs in the plane or in space at chosen frames, coloured by strain; broken ones are dashed grey lines.
 
-    `sheet` is a lattice or its springs. The colours go from -limit to limit, a strain; by default as far as that of
-    99 % of the springs that are shown. The other arguments are as in `plot.cloth`. Returns the figure.
+    `sheet` is a lattice or its springs, or rods, which have no strain. The colours go from -limit to limit, a strain; by
+    default as far as that of 99 % of the springs that are shown. The other arguments are as in `plot.cloth`. Returns the
+    figure.
 
     Example:
         >>> figure = plot.springs(wave, sheet, frames=[0, 10])
@@ -86,12 +90,27 @@ def springs(
 
 
 def take_springs(
-    who: str, film: Trajectory, sheet: Lattice | Springs, scene: int | Sequence[int] | None
+    who: str, film: Trajectory, sheet: Lattice | Springs | Rods, scene: int | Sequence[int] | None
 ) -> tuple[Frames, Springs, tuple[int, ...]]:
     """The film of one scene, the springs in it, and the place of that scene in a batch."""
+    if isinstance(sheet, Rods):
+        seen = take_frames(who, film, scene=scene)
+        return seen, _build_lines_of_rods(who, sheet, seen.position[0]), find_batch_index(who, film, scene)
     given = get_springs(who, sheet)
     seen = take_frames(who, film, scene=scene, nodes=given.nodes)
     return seen, given, find_batch_index(who, film, scene)
+
+
+def _build_lines_of_rods(who: str, rods: Rods, position: np.ndarray) -> Springs:
+    """Springs where rods join two particles, as long as at the start: an anchor is no node, and its rod is not drawn."""
+    pairs = np.array([pair for pair in rods.pairs if min(pair) >= 0]).reshape(-1, 2)
+    if not len(pairs) or pairs.max() >= len(position):
+        raise ValueError(
+            f"{who}: got rods {rods.pairs} and {len(position)} nodes, expected rods between them. Pivots that are drawn are "
+            "pinned particles."
+        )
+    line = position[pairs[:, 1]] - position[pairs[:, 0]]
+    return Springs(pairs, 0.0, np.sqrt((line * line).sum(axis=-1)), nodes=len(position))
 
 
 def build_spring_lines(
@@ -110,9 +129,10 @@ def build_spring_lines(
     if limit is None:
         most = [_strain_percentile(spring_lines, run.position[frame].astype(float), frame) for frame in frames]
         limit = min(max(most), MAX_BLOWN_UP_STRAIN if run.blew_up else np.inf)
+        limit = limit if limit > ROUNDING_STRAIN else MIN_STRAIN_LIMIT
     elif not limit > 0:
         raise ValueError(f"{who}: got limit={limit}, expected a strain > 0, e.g. 0.05 for five per cent.")
-    return spring_lines._replace(limit=float(limit) or MIN_STRAIN_LIMIT)
+    return spring_lines._replace(limit=float(limit))
 
 
 def _select_scene(numbers: np.ndarray, index: tuple[int, ...]) -> np.ndarray:

@@ -9,7 +9,20 @@ from physjax.scenes import SCENES, title
 from physjax.scenes.orbits import read_newtonian_places
 from physjax.scenes.registry import read_table
 
-SLOW = ("car", "ragdoll", "tumbling_box", "rolling", "bowling", "smoke", "sparks", "stiff_flag", "stiff_jelly")
+SLOW = (
+    "car",
+    "ragdoll",
+    "heavy_rope",
+    "chain_bridge",
+    "triple_pendulum",
+    "tumbling_box",
+    "rolling",
+    "bowling",
+    "smoke",
+    "sparks",
+    "stiff_flag",
+    "stiff_jelly",
+)
 PILES = ("box_on_slope", "stack_of_ten", "stack_of_sizes", "pyramid", "card_house")
 SOLIDS = (*PILES, "newtons_cradle", "billiard_break", "dominoes", "marble_run", "see_saw")
 """What compiles for many seconds."""

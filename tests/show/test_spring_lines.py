@@ -126,3 +126,14 @@ def test_springs_on_a_line_are_refused():
     film = simulate(scene, methods.euler, dt=1e-3, steps=1)
     with pytest.raises(ValueError, match="got positions with 1 component, expected 2 or 3"):
         plot.springs(film, tie)
+
+
+def test_rods_are_lines_without_a_strain_and_anchors_are_not_drawn():
+    x = np.array([[0.5, -0.5], [1.0, -1.5], [2.0, -1.0]])
+    rods = springs.Rods([(-1, 0), (0, 1), (1, 2)], anchors=[(0.0, 0.0)])
+    film = simulate(Scene(Particles(x, np.zeros((3, 2))), forces=(rods,)), methods.verlet, dt=0.01, steps=1)
+    panel, bar = plot.springs(film, rods, -1).axes
+    assert len(layers(panel)[0].get_segments()) == 2
+    assert bar.get_xlim() == pytest.approx((-1.0, 1.0))
+    with pytest.raises(ValueError, match="Pivots that are drawn are pinned particles"):
+        plot.springs(film, springs.Rods([(-1, 0)], anchors=[(0.0, 0.0)]))

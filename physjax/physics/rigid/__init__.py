@@ -8,7 +8,7 @@
 Forces on particles act at the center of mass, and with `AtPoint` at any point. Everything else is a `Load`: `(t,
 bodies, inertia) -> Wrench`. Points of a body are given in its own frame, from its center of mass. `ContactPoints` are
 those that can touch; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what they may not pass, and
-`Joints` hold bodies together.
+`Joints` hold bodies together, exactly or as springs; `Hinges`, `Welds`, `Sliders` and `Rods` are exact.
 """
 
 from physjax.physics.rigid.body_points import (
@@ -19,6 +19,7 @@ from physjax.physics.rigid.body_points import (
     point_velocity,
 )
 from physjax.physics.rigid.contact_points import ContactPoints
+from physjax.physics.rigid.joint_kinds import Hinges, Rods, Sliders, Welds
 from physjax.physics.rigid.joints import Joints, hinge
 from physjax.physics.rigid.loads import (
     AtPoint,
@@ -45,6 +46,7 @@ __all__ = [
     "AtPoint",
     "Balls",
     "ContactPoints",
+    "Hinges",
     "Hull",
     "Joints",
     "Load",
@@ -53,12 +55,15 @@ __all__ = [
     "PlanarInertia",
     "PlanarShape",
     "RigidBodies",
+    "Rods",
     "RotationalDrag",
+    "Sliders",
     "Solids",
     "SurfaceContact",
     "Thrust",
     "Torque",
     "Touch",
+    "Welds",
     "Wrench",
     "angular_acceleration",
     "angular_velocity",

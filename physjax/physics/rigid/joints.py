@@ -1,6 +1,6 @@
-"""Joints between rigid bodies: stiff damped springs between points that should coincide."""
+"""Ball joints between rigid bodies: exact, or stiff damped springs between points that should coincide."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -9,79 +9,128 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.checks import Numbers, as_real_quantity, quantity, unchecked_quantity
+from physjax.checks import (
+    Numbers,
+    OptionalNumbers,
+    as_positive_integer,
+    as_real_quantity,
+    quantity,
+    unchecked_quantity,
+)
+from physjax.constraints.constraint import demand_order
+from physjax.constraints.coordinates import Places
+from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
+from physjax.physics.rigid.body_joints import BodyJoints, check_joints, read_bodies, subtract_points
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench, angular_velocity
+from physjax.physics.rigid.planar.bodies import PlanarBodies
+from physjax.physics.rigid.spatial import RigidBodies, Wrench, angular_velocity
 from physjax.vectors import broadcast_vector, cross, dot, norm, rotate_vector, scale
 
 
-class Joints(Load):
-    """Ball joints: F = k d + c ḋ at a point of each of two bodies, d [m] from the first point to the second.
+class Joints(BodyJoints):
+    """Ball joints, in the plane hinges: a point of each of two bodies stays at that of the other.
 
-    `pairs` `(joints, 2)` are indices into the last lane axis, `points` `(joints, 2, 3)` the places [m] in the frames of
-    the two bodies, from their centers of mass. Stiffness k [N/m] and damping c [kg/s] are shared or per joint. A hinge is
-    two ball joints on its axis: see `hinge`. The points separate by about load/k, which `error` reports; a step must
-    resolve √(m/k) of the lightest body.
+    `pairs` `(joints, 2)` are indices into the last lane axis, -1 for the world; `points` `(joints, 2, dim)` are places [m] in the
+    frames of the two bodies, from their centers of mass. Without a stiffness joints are exact, as `springs.Rods` are, with
+    the same `order` and `substeps`: they add no stiffness, open by no load, and `constraint_forces` gives their forces.
+
+    With a `stiffness` k [N/m] and a `damping` c [kg/s], shared or per joint, they are springs between bodies in space,
+    F = k d + c ḋ, with d from the first point to the second: the points separate by about load/k, and a step must resolve
+    √(m/k) of the lightest body. `error` reports how far. A hinge in space is `Hinges`, of springs two ball joints on its axis
+    (`hinge`).
 
     Example:
-        >>> arm = rigid.Joints([(0, 1)], [[[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]]], stiffness=1e3)
-        >>> print(arm.error(rigid.bodies(brick, [[0.0, 0.0, 0.0], [1.25, 0.0, 0.0]])))
-        [0.25]
+        >>> plate = inertia.planar_plate(2.0, (1.0, 0.2))
+        >>> shelf = rigid.planar_bodies(plate, [[0.5, 0.0]])
+        >>> nail = rigid.Joints([(-1, 0)], [[[0.0, 0.0], [-0.5, 0.0]]])
+        >>> end = simulate(Scene(shelf, plate, (forces.Gravity(), nail)), methods.verlet, dt=0.01, steps=10).final_scene.state
+        >>> round(float(nail.error(end)[0]), 6)
+        0.0
     """
 
     couples: ClassVar[bool] = True
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
-    stiffness: Numbers = quantity("stiffness k", "N/m", per="joint", above=0)
-    damping: Numbers = quantity("damping c", "kg/s", per="joint", at_least=0)
+    pairs: Pairs = eqx.field(static=True)
+    points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
+    stiffness: OptionalNumbers = quantity("stiffness k", "N/m", per="joint", above=0, default=None)
+    damping: Numbers = quantity("damping c", "kg/s", per="joint", at_least=0, default=0.0)
+    order: int = eqx.field(static=True, default=2)
+    substeps: int = eqx.field(static=True, default=1)
 
     def __init__(
         self,
         pairs: ArrayLike | Sequence,
         points: ArrayLike | Sequence,
-        stiffness: ArrayLike | Sequence,
+        stiffness: ArrayLike | Sequence | None = None,
         damping: ArrayLike | Sequence = 0.0,
+        *,
+        order: int = 2,
+        substeps: int = 1,
     ):
-        pairs = np.asarray(pairs)
-        self.points = as_real_quantity("points of the joints [m]", points)
-        whole = pairs.dtype.kind in "iu" and pairs.ndim == 2 and pairs.shape[1:] == (2,) and pairs.size
-        if not whole or (pairs < 0).any() or (pairs[:, 0] == pairs[:, 1]).any():
-            raise ValueError(f"Joints: got pairs {pairs.tolist()}, expected (joints, 2) indices of different bodies.")
-        if self.points.shape != (len(pairs), 2, 3):
-            raise ValueError(
-                f"Joints: got points {self.points.shape}, expected {(len(pairs), 2, 3)}: one on each body."
-            )
-        self.pairs = tuple((int(i), int(j)) for i, j in pairs)
-        self.stiffness = as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
+        self.pairs, self.points = check_joints("Joints", pairs, points)
+        self.stiffness = None if stiffness is None else as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
+        self.order, self.substeps = demand_order("Joints", order), as_positive_integer("substeps", substeps)
+        if self.stiffness is not None and (np.asarray(self.pairs) < 0).any():
+            raise ValueError(
+                "Joints: got the world, -1, and a stiffness; springs to the world are AtPoint(point, Anchor(...))."
+            )
+
+    @property
+    def response(self) -> Callable | None:
+        """How motion is kept on exact joints; None of springs."""
+        return super().response if self.stiffness is None else None
+
+    @property
+    def rows(self) -> int:
+        """As many as there are directions."""
+        return self.points.shape[-1]
+
+    def measure(self, first: Places, second: Places) -> Float[Array, "dim joints worlds"]:
+        """From the first point to the second [m]."""
+        return jnp.stack(subtract_points(self.place_ends(first, second)))
+
+    def prepare(self, state: PyTree, mass: PyTree) -> "Joints":
+        """The joints as part of a scene; exact ones are closed at its start."""
+        if self.stiffness is None:
+            super().prepare(state, mass)
+        return self
 
     def __call__(self, t: Time, state: PyTree, mass: PyTree) -> Wrench:
-        """The wrench; a TypeError for a state that is not of bodies in space."""
+        """The wrench of springs; a TypeError for a state that is not of bodies in space."""
+        if self.stiffness is None:
+            return Wrench()
         if not isinstance(state, RigidBodies):
-            raise TypeError(f"Joints: got a state of type {type(state).__name__}, expected RigidBodies.")
+            raise TypeError(f"Joints: got a state of type {type(state).__name__}, expected RigidBodies for springs.")
         return self.wrench(t, state, mass)
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether they are springs."""
+        return self.stiffness is not None
 
     def wrench(self, t: Time, bodies: RigidBodies, inertia: Inertia) -> Wrench:
         """Forces and torques on all bodies, with equal and opposite forces at each joint."""
         straight, omega = scale(1 / inertia.mass, bodies.momentum), angular_velocity(bodies, inertia)
         arm, place, straight, omega = self._locate_ends(bodies, straight, omega)
         apart, closing = self._subtract_ends(place), self._subtract_ends(straight + cross(omega, arm))
-        pull = self.stiffness * apart + self.damping * closing
+        stiffness = jnp.asarray(self.stiffness)  # of springs there is one
+        pull = stiffness * apart + self.damping * closing
         force = jnp.concatenate([pull, -pull], axis=-2)
         total = self._sum_by_body(jnp.concatenate([force, cross(arm, force)], axis=-1), bodies)
         return Wrench(total[..., :3], total[..., 3:])
 
     def potential(self, t: ArrayLike, state: RigidBodies, mass: Inertia) -> Float[Array, "*lanes"]:
-        """½k d² [J], halved between the two bodies."""
+        """½k d² [J] of springs, halved between the two bodies."""
         apart = self._subtract_ends(self._locate_ends(state)[1])
-        half = 0.25 * self.stiffness * dot(apart, apart)
+        half = 0.25 * jnp.asarray(self.stiffness) * dot(apart, apart)
         shares = jnp.concatenate([half, half], axis=-1)[..., None]
         return self._sum_by_body(shares, state)[..., 0]
 
-    def error(self, bodies: RigidBodies) -> Float[Array, "*scenes joints"]:
+    def error(self, bodies: RigidBodies | PlanarBodies) -> Float[Array, "*scenes joints"]:
         """How far the two points of each joint are apart [m]."""
-        return norm(self._subtract_ends(self._locate_ends(bodies)[1]))
+        apart = self.measure(*self.find_ends(read_bodies(bodies)))
+        return norm(jnp.moveaxis(apart, (0, 1, 2), (2, 1, 0))).reshape(*bodies.lanes[:-1], len(self.pairs))
 
     def _locate_ends(self, bodies: RigidBodies, *more: Array) -> list[Array]:
         """Of the ends of joints, first ends then second ends: arm and place [m], and what `more` says of their bodies."""

@@ -25,7 +25,8 @@ from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.response import collide, fold_body_flights
 from physjax.physics.rigid.spatial import RigidBodies
-from physjax.scene import Scene, Stage, free_motion
+from physjax.scene import Scene
+from physjax.stages import Stage
 from physjax.stepping.reference import build_default_solver, cast_floats
 from physjax.study import energy
 from physjax.study.energy.solids import fold_solid_flights
@@ -192,7 +193,7 @@ def _observe_motion(
     scene: Scene, method: Stepper, t: Time, dt: Array, substeps: Array, budget: EnergyBudget
 ) -> tuple[EnergyBudget, PyTree]:
     """The budget with the motion of a step entered, leg by leg where impacts are timed; and where the motion leads."""
-    motion = partial(free_motion, method)
+    motion = scene.constrained_motion(method)
     record = partial(_record_flight, cast_to_float64(scene), substeps)
     timed = [contact.response for contact in scene.contacts if contact.response in RESPONSE_OBSERVERS]
     if timed:
@@ -245,8 +246,10 @@ def _record_flight(whole: Scene, substeps: Array, budget: EnergyBudget, flight: 
             entries[PINS] = _mask_amounts(held, holding)
             leaning = [share & ~held for share in leaning]
         entries = _add_entries(entries, _split_by_contact(contacts, leaning, holding))
-    elif PINS in budget or PIVOTS in budget:
-        entries[PINS if PINS in budget else PIVOTS] = holding
+    elif whole.constraints or PINS in budget or PIVOTS in budget:
+        # what holds joints does no work, and gives momentum where it is fixed in the world
+        joints = [name for name, force in zip(names, whole.forces, strict=True) if force.response is not None]
+        entries[next(name for name in (PINS, PIVOTS, *joints) if name in budget)] = holding
     if flight.active is not None:
         entries = {name: _mask_amounts(flight.active, entry) for name, entry in entries.items()}
     return _add_entries(budget, entries)

@@ -1,0 +1,151 @@
+"""All joints of a scene as one system: by how much they are off, their Jacobian, and what impulses on them do."""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from physjax.constraints.block_solve import Blocks, solve_blocks
+from physjax.constraints.constraint import Constraint
+from physjax.constraints.coordinates import Coordinates, Moves, Places, put_worlds_last
+from physjax.constraints.elimination import Elimination, Pairs, plan_elimination
+
+Jacobian = Float[Array, "freedoms rows ends worlds"]
+"""How the rows of each joint change with moves of its two ends: first ends of all joints, then second ends."""
+Rows = Float[Array, "rows joints worlds"]
+"""A number for each row of each joint."""
+
+
+class Mechanism(NamedTuple):
+    """The joints of a scene, how its bodies are read, which of them move (1) or not (0), and the order of elimination."""
+
+    parts: tuple[Constraint, ...]
+    coordinates: Coordinates
+    free: Float[Array, "bodies worlds"]
+    pairs: Pairs
+
+    @classmethod
+    def of(cls, scene: PyTree) -> "Mechanism":
+        """The mechanism of a scene."""
+        parts = find_constraints(scene)
+        lanes, dtype = scene.state.lanes, scene.state.dtype
+        free = jnp.ones((), dtype) if scene.held is None else 1 - jnp.asarray(scene.held).astype(dtype)
+        pairs = tuple(pair for part in parts for pair in part.pairs)
+        return cls(parts, parts[0].coordinates(scene.state), put_worlds_last(free, lanes), pairs)
+
+    @property
+    def plan(self) -> Elimination:
+        """The order of elimination."""
+        return plan_elimination(self.pairs)
+
+    @property
+    def rows(self) -> int:
+        """The most rows that a joint has."""
+        return max(part.rows for part in self.parts)
+
+    def measure(self, places: Places) -> Rows:
+        """By how much each joint is off."""
+        return self._join([part.measure(*part.find_ends(places)) for part in self.parts], 0)
+
+    def differentiate(self, places: Places) -> Jacobian:
+        """The Jacobian of `measure`."""
+        found = [self._differentiate_part(part, *part.find_ends(places)) for part in self.parts]
+        return jnp.concatenate([self._join(list(ends), 1) for ends in zip(*found, strict=True)], axis=-2)
+
+    def _differentiate_part(self, part: Constraint, first: Places, second: Places) -> tuple[Array, Array]:
+        move, count = self.coordinates.displace, self.coordinates.freedoms
+        still = jnp.zeros((count, *first.shape[1:]), first.dtype)
+        units = jnp.broadcast_to(jnp.eye(count, dtype=first.dtype)[..., None, None], (count, *still.shape))
+        along = lambda function: jax.vmap(lambda unit: jax.jvp(function, (still,), (unit,))[1])(units)  # noqa: E731
+        return (
+            along(lambda moves: part.measure(move(first, moves), second)),
+            along(lambda moves: part.measure(first, move(second, moves))),
+        )
+
+    def _join(self, arrays: list[Array], axis: int) -> Array:
+        """Arrays of parts as one of all joints, with as many rows for each."""
+        if len(arrays) == 1:
+            return arrays[0]
+        pad = lambda a: [(0, self.rows - n if i == axis else 0) for i, n in enumerate(a.shape)]  # noqa: E731
+        return jnp.concatenate([jnp.pad(a, pad(a)) for a in arrays], axis=-2)
+
+    def sum_at_bodies(self, jacobian: Jacobian, impulses: Rows) -> Moves:
+        """What impulses of the joints do to the bodies that move: Jᵀλ, `(freedoms, bodies, worlds)`."""
+        both = jnp.concatenate([impulses, impulses], axis=-2)
+        ends = jnp.sum(jacobian * both[None], axis=1)
+        padded = jnp.pad(ends, ((0, 0), (0, 1), (0, 0)))
+        slots = _list_ends_of_bodies(self.pairs, len(self.free))
+        total = jnp.take(padded, slots[0], axis=1, mode="clip")
+        for slot in slots[1:]:
+            total = total + jnp.take(padded, slot, axis=1, mode="clip")
+        return self.free[None] * total
+
+    def measure_rates(self, jacobian: Jacobian, rates: Moves) -> Rows:
+        """How fast the joints open: J q̇."""
+        ends = self._at_ends(rates)
+        each = jnp.sum(jacobian * ends[:, None], axis=0)
+        first, second = jnp.split(each, 2, axis=-2)
+        return first + second
+
+    def move_by_impulses(self, mobility: Array, jacobian: Jacobian) -> Jacobian:
+        """M⁻¹Jᵀ: the velocities that a unit impulse of each row gives to both ends."""
+        return self.coordinates.apply_mobility(self._at_ends(self.free[None] * mobility)[:, None], jacobian)
+
+    def build_matrix(self, jacobian: Jacobian, moved: Jacobian) -> Blocks:
+        """J M⁻¹ Jᵀ, from the Jacobian at one place and M⁻¹Jᵀ there or at another; one for rows that a joint lacks."""
+        plan, joints = self.plan, len(self.pairs)
+        whole = _contract(jacobian, moved)
+        own = whole[..., :joints, :] + whole[..., joints:, :]
+        lacks = np.concatenate(
+            [np.repeat(np.arange(self.rows) >= p.rows, len(p.pairs)).reshape(self.rows, -1) for p in self.parts], axis=1
+        )
+        if lacks.any():
+            own = own + (np.eye(self.rows)[..., None] * lacks).astype(own.dtype)[..., None]
+        pad = lambda a: jnp.pad(a, [(0, 0), (0, 0), (0, 1), (0, 0)])  # noqa: E731
+        left, right = pad(jacobian), pad(moved)
+        pick = lambda a, ends: jnp.take(a, ends, axis=-2, mode="clip")  # noqa: E731
+        empty = jnp.zeros((*own.shape[:2], len(plan.edges), own.shape[-1]), own.dtype)
+        lower, upper = empty, empty
+        for early, late in plan.shared:
+            lower = lower + _contract(pick(left, late), pick(right, early))
+            upper = upper + _contract(pick(left, early), pick(right, late))
+        return Blocks(own, lower, upper)
+
+    def solve(self, matrix: Blocks, right: Rows) -> Rows:
+        """The impulses with matrix λ = right."""
+        return solve_blocks(self.plan, matrix, right)
+
+    def _at_ends(self, table: Array) -> Array:
+        """What the bodies at both ends of each joint have; zero for the world."""
+        pairs, bodies = np.asarray(self.pairs, np.int32), len(self.free)
+        index = np.where(pairs < 0, np.int32(bodies), pairs).T.ravel()
+        if (pairs < 0).any():
+            table = jnp.pad(table, [(0, 0)] * (table.ndim - 2) + [(0, 1), (0, 0)])
+        return jnp.take(table, index, axis=-2, mode="clip")
+
+
+def find_constraints(scene: PyTree) -> tuple[Constraint, ...]:
+    """What a scene holds exactly."""
+    return tuple(force for force in scene.forces if force.response is not None)
+
+
+def _contract(left: Array, right: Array) -> Array:
+    """Σ over freedoms of the products of all rows with all rows, `(rows, rows, entries, worlds)`."""
+    return jnp.sum(left[:, :, None] * right[:, None], axis=0)
+
+
+@cache
+def _list_ends_of_bodies(pairs: Pairs, bodies: int) -> np.ndarray:
+    """Which ends each body has, `(most, bodies)`; twice the number of joints is none."""
+    ends = np.asarray(pairs, np.int32).T.ravel()
+    slots = [np.flatnonzero(ends == body) for body in range(bodies)]
+    table = np.full((max(map(len, slots)), bodies), len(ends), np.int32)
+    for body, slot in enumerate(slots):
+        table[: len(slot), body] = slot
+    return table
+
+
+__all__ = ["Jacobian", "Mechanism", "Rows", "find_constraints"]

@@ -1,0 +1,135 @@
+"""What all exact joints between bodies have in common: two points that they join, and how these are read."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
+
+from physjax.checks import as_real_quantity
+from physjax.constraints.constraint import Constraint, check_joint_pairs, demand_closed
+from physjax.constraints.coordinates import Places
+from physjax.constraints.elimination import Pairs
+from physjax.loops import Time
+from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.joint_coordinates import (
+    BodyCoordinates,
+    PlanarCoordinates,
+    SpatialCoordinates,
+    choose_coordinates,
+)
+from physjax.physics.rigid.planar.bodies import PlanarBodies
+from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench
+
+Ends = tuple[list[Array], list[Array]]
+"""The points of the first and of the second bodies in the world, in components `(joints, worlds)`."""
+
+
+class BodyJoints(Constraint, Load):
+    """Joints between a point of each of two bodies, in their frames; of the world, index -1, the point is its place."""
+
+    points: eqx.AbstractVar[Array]
+
+    @property
+    def reader(self) -> BodyCoordinates:
+        """How bodies are read, in the plane or in space as the points are given."""
+        return PlanarCoordinates() if self.points.shape[-1] == 2 else SpatialCoordinates()
+
+    def wrench(self, t: Time, bodies: PyTree, inertia: PyTree) -> Wrench:
+        """No load of its own: the scene's motion is kept on the joints."""
+        return Wrench()
+
+    def coordinates(self, state: PyTree) -> BodyCoordinates:
+        """Those of bodies in the plane or in space."""
+        return choose_coordinates(type(self).__name__, state)
+
+    def world_places(self, dtype: np.dtype) -> Places:
+        """The world as one body, at the origin."""
+        return self.reader.world_place(dtype)
+
+    def extent(self) -> Array:
+        """The largest coordinate of a point [m]."""
+        return jnp.max(jnp.abs(self.points))
+
+    def place_ends(self, first: Places, second: Places) -> Ends:
+        """Both points in the world."""
+        points = jnp.moveaxis(self.points, 0, 2)[..., None]
+        return self.reader.place_points(first, points[0]), self.reader.place_points(second, points[1])
+
+    def prepare(self, state: PyTree, mass: PyTree) -> "BodyJoints":
+        """The joints as part of a scene, closed at its start; a ValueError where they cannot be."""
+        name, dim = type(self).__name__, self.coordinates(state).dim
+        if self.points.shape[-1] != dim:
+            raise ValueError(
+                f"{name}: got points of shape {self.points.shape}, expected {(len(self.pairs), 2, dim)} for such bodies."
+            )
+        if isinstance(mass, Inertia) and mass.arm is not None:
+            raise ValueError(
+                f"{name}: got bodies on a pivot, expected free ones. Join a point of theirs to the world, -1."
+            )
+        demand_closed(self, state, lambda joint: f"the joint {joint} of {self.pairs[joint]}")
+        return self
+
+
+def check_joints(
+    name: str, pairs: ArrayLike | Sequence, points: ArrayLike | Sequence
+) -> tuple[Pairs, Float[Array, "joints 2 dim"]]:
+    """Pairs and points, if they fit."""
+    found = as_real_quantity("points of the joints [m]", points)
+    joined = check_joint_pairs(name, pairs, 1)
+    if found.ndim != 3 or found.shape[:2] != (len(joined), 2) or found.shape[2] not in (2, 3):
+        raise ValueError(
+            f"{name}: got points {found.shape}, expected {(len(joined), 2, 3)}, or of bodies in the plane "
+            f"{(len(joined), 2, 2)}: one on each body."
+        )
+    return joined, found
+
+
+@jax.jit
+def measure_turns(part: BodyJoints, state: PyTree) -> Array:
+    """How the second body of each joint is turned relative to the first: `(*scenes, joints)`, in space quaternions."""
+    reader = part.coordinates(state)
+    turns = reader.compare(*part.find_ends(reader.read_places(state)))
+    turns = jnp.moveaxis(turns, (0, 1, 2), (2, 1, 0)).reshape(*state.lanes[:-1], len(part.pairs), len(turns))
+    return turns[..., 0] if turns.shape[-1] == 1 else turns
+
+
+def put_joints_last(number: Array, components: int) -> Array:
+    """A number or a vector for each joint, `(*scenes, joints)` or with components last, as `(components, joints, worlds)`."""
+    own = number[..., None] if components == 1 else number
+    return jnp.moveaxis(own.reshape(-1, *own.shape[-2:]), (0, 1, 2), (2, 1, 0))
+
+
+def subtract_points(ends: Ends) -> list[Array]:
+    """From the first point of each joint to its second [m], in components."""
+    return [b - a for a, b in zip(*ends, strict=True)]
+
+
+def dot_components(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """The scalar product of vectors in components."""
+    total = a[0] * b[0]
+    for p, q in zip(a[1:], b[1:], strict=True):
+        total = total + p * q
+    return total
+
+
+def read_bodies(bodies: RigidBodies | PlanarBodies) -> Places:
+    """Where bodies are, as joints read them."""
+    if isinstance(bodies, PlanarBodies):
+        return PlanarCoordinates().read_places(bodies)
+    return SpatialCoordinates().read_places(bodies)
+
+
+__all__ = [
+    "BodyJoints",
+    "Ends",
+    "check_joints",
+    "dot_components",
+    "measure_turns",
+    "put_joints_last",
+    "read_bodies",
+    "subtract_points",
+]
