@@ -275,6 +275,9 @@ def build_memory_mask(part: PyTree) -> PyTree:
     mask = jax.tree.map(lambda _: False, part)
     if part is None or not part.memory:
         return mask
+    if all(getattr(part, name) is None for name in part.memory):
+        name = type(part).__name__
+        raise ValueError(f"{name}: got one that no scene has prepared, expected it given to Scene(...), not to replace().")
     return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
 
 
