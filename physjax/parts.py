@@ -277,7 +277,9 @@ def build_memory_mask(part: PyTree) -> PyTree:
         return mask
     if all(getattr(part, name) is None for name in part.memory):
         name = type(part).__name__
-        raise ValueError(f"{name}: got one that no scene has prepared, expected it given to Scene(...), not to replace().")
+        raise ValueError(
+            f"{name}: got one that no scene has prepared, expected it given to Scene(...), not to replace()."
+        )
     return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
 
 
