@@ -253,11 +253,14 @@ def bounded_while_loop(going: Callable[[T], Array], body: Callable[[T], T], star
     return lax.while_loop(goes_on, turn, (start, jnp.arange(2, dtype=jnp.int32)))[0]
 
 
-def differentiable_while_loop(going: Callable[[T], Array], turn: Callable[[T], T], start: T, *, most: int) -> T:
+def differentiable_while_loop(
+    going: Callable[[T], Array], turn: Callable[[T], T], start: T, *, most: int, lanes_last: bool = False
+) -> T:
     """`lax.while_loop(going, turn, start)`, with derivatives forward and reverse, of any order.
 
-    `going` has one flag a lane. Where something is differentiated the loop is one over chunks of turns, left out from where
-    no lane is going; reverse mode stores √`most` carries. Derivatives of lanes that need more than `most` turns are NaN.
+    `going` has one flag a lane; lanes are the first axes of all arrays, or the last ones. Where something is differentiated
+    the loop is one over chunks of turns, left out from where no lane is going; reverse mode stores √`most` carries.
+    Derivatives of lanes that need more than `most` turns are NaN.
     """
     if jit_is_disabled():  # so that all numbers can be looked at
         while any_lane(going(start)):
@@ -277,7 +280,7 @@ def differentiable_while_loop(going: Callable[[T], Array], turn: Callable[[T], T
 
         end, change = jax.jvp(bounded, given, changes)
         lost = go(given[0], end)
-        return end, jax.tree.map(lambda leaf: _invalidate(leaf, lost), change)
+        return end, jax.tree.map(lambda leaf: _invalidate(leaf, lost, lanes_last), change)
 
     return run(known, closed_over, start)
 
@@ -310,12 +313,13 @@ def _repeat_while(going: Callable, turn: Callable, start: T, most: int) -> T:
     return lax.scan(lambda carry, _: (go_on(carry, chunk), None), start, None, length=-(-most // length))[0]
 
 
-def _invalidate(leaf: Array | np.ndarray, lost: Array) -> Array | np.ndarray:
+def _invalidate(leaf: Array | np.ndarray, lost: Array, lanes_last: bool) -> Array | np.ndarray:
     """The derivative, NaN for lanes that are lost."""
     if leaf.dtype == jax.dtypes.float0:
         return leaf
     kept = jnp.where(lost, jnp.nan, 1.0).astype(leaf.dtype)
-    return leaf * kept.reshape(kept.shape + (1,) * (leaf.ndim - kept.ndim))
+    others = (1,) * (leaf.ndim - kept.ndim)
+    return leaf * kept.reshape(others + kept.shape if lanes_last else kept.shape + others)
 
 
 def _fit_unrolled(unrolled: int, length: int) -> int:

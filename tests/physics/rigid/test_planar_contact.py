@@ -135,6 +135,21 @@ def test_bounces_are_first_order_in_the_sub_steps():
     assert np.log(measure_error(2) / measure_error(16)) / np.log(8) == pytest.approx(1.0, abs=0.15)
 
 
+def test_every_one_of_many_worlds_has_its_derivative():
+    place = np.stack([np.zeros(80), np.linspace(1.0, 1.5, 80)], axis=-1)[:, None]
+    solids = rigid.Solids(DISC, (floor(0.0, restitution=0.8),))
+
+    def fall(speed):
+        thrown = rigid.planar_bodies(BALL, place, velocity=jnp.stack([0 * speed, speed])[None, None])
+        scene = Scene(thrown, BALL, (forces.Gravity(),), contacts=(solids,))
+        return simulate(scene, methods.verlet, dt=1 / 60, steps=40, save_every=40).state.position[-1, :, 0, 1]
+
+    run = jax.jit(lambda speed: jax.jvp(fall, (speed,), (1.0,)))
+    step = 1e-7
+    difference = (run(0.1 + step)[0] - run(0.1 - step)[0]) / (2 * step)
+    np.testing.assert_allclose(run(0.1)[1], difference, atol=1e-5)
+
+
 # friction
 
 

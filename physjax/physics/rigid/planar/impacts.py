@@ -90,7 +90,9 @@ def resolve_impacts(
     some = choose_group_worlds(worlds)
     if some is None:
         sweep = partial(_sweep, groups, scene)
-        return differentiable_while_loop(_is_going, sweep, start, most=MAX_SWEEPS_WITH_DERIVATIVES).velocity
+        return differentiable_while_loop(
+            _is_going, sweep, start, most=MAX_SWEEPS_WITH_DERIVATIVES, lanes_last=True
+        ).velocity
 
     def sweep_some(all_worlds: _Round) -> _Round:
         index = jnp.argsort(~_is_going(all_worlds), stable=True)[:some]
@@ -99,12 +101,12 @@ def resolve_impacts(
         begun = few, jnp.zeros(some, jnp.int32)
         going = lambda turn: _is_going(turn[0]) & (turn[1] < SWEEPS_AT_A_TIME)  # noqa: E731
         sweep = lambda turn: (_sweep(groups, scene_of_few, turn[0]), turn[1] + 1)  # noqa: E731
-        few, _ = differentiable_while_loop(going, sweep, begun, most=SWEEPS_AT_A_TIME)
+        few, _ = differentiable_while_loop(going, sweep, begun, most=SWEEPS_AT_A_TIME, lanes_last=True)
         write = lambda leaf, new: leaf.at[..., index].set(new, unique_indices=True)  # noqa: E731
         return jax.tree.map(write, all_worlds, few)
 
     most = MAX_SWEEPS_WITH_DERIVATIVES // SWEEPS_AT_A_TIME * -(-worlds // some)
-    return differentiable_while_loop(_is_going, sweep_some, start, most=most).velocity
+    return differentiable_while_loop(_is_going, sweep_some, start, most=most, lanes_last=True).velocity
 
 
 def _is_going(this: _Round) -> Array:
