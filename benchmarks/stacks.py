@@ -140,10 +140,11 @@ def draw_promises(path: Path, found: dict[int, dict[str, float]], caption: str) 
     for ax, (title, lines) in zip(axes, panels.items(), strict=True):
         for key, label in lines.items():
             ax.loglog(counts, [found[n][key] for n in counts], "o-", label=label)
-        first = found[int(counts[0])][next(iter(lines))]
+        last = found[int(counts[-1])][next(iter(lines))]
         for order, style in ((1, ":"), (2, "--")):
-            ax.loglog(counts, first * counts.astype(float) ** -order, style, color="0.6", label=f"order {order}")
-        ax.set(title=title, xlabel="sub-steps of a step of 1/60 s")
+            ax.loglog(counts, last * (counts[-1] / counts) ** order, style, color="0.6", label=f"order {order}")
+        ax.set_title(title, fontsize=10)
+        ax.set(xlabel="sub-steps of a step of 1/60 s")
         ax.set_xticks(counts, [str(n) for n in counts])
         ax.minorticks_off()
         ax.legend(fontsize=8)

@@ -39,6 +39,11 @@ class Solids(Contact):
     a contact that moves a mass m sinks by F h²/(2π² m), h the sub-step. First order in h where bodies collide; what
     approaches slower than twice what forces change in a sub-step does not bounce.
 
+    What that comes to with 4 and with 8 sub-steps of 1/60 s (`benchmarks/stacks.py`): after a bounce or two, balls are off by
+    5 and 3 mm; a stack of ten boxes of 1 m sinks by 1.1 and 0.3 mm, and sways by 2 and 0.5 mm before it is still. In 20 000
+    drops of two to six bodies the energy was never above that at the start; what is fast and meets corner to corner may
+    overlap by a part of its way in a sub-step, in one of a hundred worlds of six bodies by 2 % of the smallest.
+
     Example:
         >>> crate, floor = inertia.planar_plate(2.0, (1.0, 1.0)), contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0)
         >>> solids = rigid.Solids(rigid.PlanarShape.box((1.0, 1.0)), surfaces=(floor,))
