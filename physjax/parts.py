@@ -170,6 +170,10 @@ class Force(eqx.Module):
         """The rate of a state with the forces of all that the scene holds exactly."""
         return rate
 
+    def close(self, scene: PyTree, state: PyTree) -> PyTree:
+        """The state, which something else has changed, back on all that the scene holds exactly."""
+        return state
+
     def prepare(self, state: PyTree, mass: PyTree) -> "Force":
         """The force as part of a scene that starts in this state; what it joins is checked here."""
         return self

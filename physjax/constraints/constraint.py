@@ -67,6 +67,12 @@ class Constraint(Force):
 
         return constrain_rate(scene, t, state, rate)
 
+    def close(self, scene: PyTree, state: PyTree) -> PyTree:
+        """The state with all joints of the scene closed and none opening, after contacts have moved bodies."""
+        from physjax.constraints.reactions import project_joints
+
+        return project_joints(scene, state)
+
     def find_ends(self, places: Places) -> tuple[Places, Places]:
         """The places of the first and the second end of each joint, given those of the bodies `(numbers, bodies, worlds)`."""
         bodies = places.shape[1]
