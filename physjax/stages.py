@@ -46,7 +46,7 @@ def advance_force(index: int, scene: PyTree, t: ArrayLike, dt: ArrayLike) -> PyT
     """The scene after a force with memory has seen the step."""
     force, state = scene.forces[index], scene.state
     seen, _ = state.view_for_force(force, scene.mass)
-    force, after = force.advance(t, dt, seen)
+    force, after = force.advance_within(scene, t, dt, seen)
     forces = (*scene.forces[:index], adopt_force(force), *scene.forces[index + 1 :])
     # a force that sees no state of this kind, such as one at the centres of bodies, cannot change it
     return scene.replace(state=after if seen is state else state, forces=forces)

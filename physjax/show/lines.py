@@ -44,7 +44,7 @@ def take_lines(
     run = take_frames(who, film, scene=scene, nodes=springs.nodes, dims=dims)
     index = find_batch_index(who, film, scene)
     rest = np.broadcast_to(_select_scene(np.asarray(springs.rest_length, float), index), len(springs.pairs))
-    return Lines(run, springs.pairs, rest, _find_intact_springs(who, film, springs, index))
+    return Lines(run, springs.pairs, rest, _find_unbroken(who, film, springs, index))
 
 
 def _take_rods(
@@ -58,20 +58,21 @@ def _take_rods(
     if rods.anchors is not None:
         anchors = np.broadcast_to(rods.anchors, (len(run.time), *rods.anchors.shape))
         run = run._replace(position=np.concatenate([run.position, anchors], axis=1))
-    return Lines(run, np.where(pairs < 0, nodes - 1 - pairs, pairs), None, None)
+    held = _find_unbroken(who, film, rods, find_batch_index(who, film, scene))
+    return Lines(run, np.where(pairs < 0, nodes - 1 - pairs, pairs), None, held)
 
 
-def _find_intact_springs(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...]) -> np.ndarray | None:
-    """Which springs are intact at every frame, `(frames, springs)`, as the run recorded; None where none can break."""
-    if springs.breaks_at is None:
+def _find_unbroken(who: str, film: Trajectory, lines: Springs | Rods, index: tuple[int, ...]) -> np.ndarray | None:
+    """Which lines are intact at every frame, `(frames, lines)`, as the run recorded; None where none can break."""
+    if lines.breaks_at is None:
         return None
     for part in film.parts:
-        if isinstance(part, Springs) and part.topology == springs.topology:
+        if type(part) is type(lines) and np.array_equal(part.pairs, lines.pairs):
             held = np.asarray(part.unbroken)
             return held[(slice(None), *index[: held.ndim - 2])]
     raise ValueError(
-        f"{who}: got a film without a record of which of these springs broke, expected one of a scene with them "
-        "among its forces. If it was loaded from a file, load it with scene=."
+        f"{who}: got a film without a record of which of these {type(lines).__name__.lower()} broke, expected one of a "
+        "scene with them among its forces. If it was loaded from a file, load it with scene=."
     )
 
 
