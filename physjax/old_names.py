@@ -4,6 +4,16 @@ import sys
 import warnings
 from typing import Any
 
+FORCE_OLD_NAMES = {"during": "averaged_over_step", "near": "linearised_at", "definite": "dissipative_symmetric"}
+"""What the abilities of a force were called in the first edition."""
+CONTACT_OLD_NAMES = {
+    "gap": "signed_distance",
+    "answered": "resolve",
+    "forgetting": "forget_lanes",
+    "prepared": "prepare",
+}
+"""What the methods of a contact were called in the first edition."""
+
 
 def serve_old_names(cls: type, new_names: dict[str, str]) -> None:
     """Let a class be written and called with the old names of its methods; `new_names` maps each to the name it has now.

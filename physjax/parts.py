@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import demand_start_outside
 from physjax.loops import Time
-from physjax.old_names import serve_old_names
+from physjax.old_names import CONTACT_OLD_NAMES, FORCE_OLD_NAMES, serve_old_names
 from physjax.particles import Particles, demand_particles
 from physjax.vectors import scale
 
@@ -72,21 +72,6 @@ def is_untransformed(run: PyTree) -> bool:
 def _is_library_definition(definition: Any) -> bool:
     """Whether a function or class is the library's own, which closes over nothing."""
     return getattr(definition, "__module__", "").startswith("physjax.") and "<locals>" not in definition.__qualname__
-
-
-FORCE_OLD_NAMES = {
-    "during": "averaged_over_step",
-    "near": "linearised_at",
-    "definite": "dissipative_symmetric",
-}
-"""What the abilities of a force were called in the first edition."""
-CONTACT_OLD_NAMES = {
-    "gap": "signed_distance",
-    "answered": "resolve",
-    "forgetting": "forget_lanes",
-    "prepared": "prepare",
-}
-"""What the methods of a contact were called in the first edition."""
 
 
 class Force(eqx.Module):
@@ -157,6 +142,10 @@ class Force(eqx.Module):
         """The force and the state after a step from t to t + dt [s] was taken, for one with memory: springs that break."""
         return self, state
 
+    def advance_within(self, scene: PyTree, t: ArrayLike, dt: ArrayLike, state: PyTree) -> tuple["Force", PyTree]:
+        """What `advance` returns, for a force whose memory depends on the rest of the scene: joints that break."""
+        return self.advance(t, dt, state)
+
     @property
     def remembers(self) -> bool:
         """Whether the force has memory, which `advance` changes after every step."""
@@ -169,6 +158,10 @@ class Force(eqx.Module):
     def constrain_rate(self, scene: PyTree, t: Time, state: PyTree, rate: PyTree) -> PyTree:
         """The rate of a state with the forces of all that the scene holds exactly."""
         return rate
+
+    def close(self, scene: PyTree, state: PyTree) -> PyTree:
+        """The state, which something else has changed, back on all that the scene holds exactly."""
+        return state
 
     def prepare(self, state: PyTree, mass: PyTree) -> "Force":
         """The force as part of a scene that starts in this state; what it joins is checked here."""

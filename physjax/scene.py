@@ -50,7 +50,7 @@ from physjax.quantities import (
     mark_invalid_lanes,
     may_hide_lanes,
 )
-from physjax.stages import Stage, advance_force, prescribe, resolve_contact
+from physjax.stages import Stage, advance_force, close_joints, prescribe, resolve_contact
 
 
 def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
@@ -287,7 +287,8 @@ class Scene(eqx.Module):
 
         "move": the method's step, with what contacts resolve within it (all of them where an emitter gives each
         particle a step of its own); "resolve contacts": each contact that projects; "prescribe": kinematic nodes are
-        put on their path, held ones back in their place; "advance memory": each force with memory. A method that
+        put on their path, held ones back in their place; "close joints": what contacts have pulled off its joints is put
+        back on them; "advance memory": each force with memory. A method that
         subdivides the step goes through all of them in each of its own.
         """
         if isinstance(method, SubdividingMethod) and not self.only_moves and self.emitter is None:
@@ -304,6 +305,8 @@ class Scene(eqx.Module):
             stages = [Stage("move", lambda scene: emitter.live(motion, scene, t, dt))]
         if self.prescribed_motion is not None or (self.contacts and self.pinned is not None):
             stages.append(Stage("prescribe", partial(prescribe, start=self.state, t=t + dt)))
+        if self.constraints and self.contacts:
+            stages.append(Stage("close joints", close_joints))
         stages += [
             Stage("advance memory", partial(advance_force, i, t=to_float_time(t), dt=dt), i)
             for i, force in enumerate(self.forces)

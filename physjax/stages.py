@@ -1,4 +1,4 @@
-"""The stages of a step that follow the motion: contacts that project, nodes on their path, memories that advance."""
+"""The stages of a step that follow the motion: contacts that project, nodes on their path, joints, memories that advance."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -37,14 +37,19 @@ def prescribe(scene: PyTree, start: PyTree, t: Time) -> PyTree:
     return scene.replace(state=jax.tree.map(keep, scene.state, start))
 
 
+def close_joints(scene: PyTree) -> PyTree:
+    """The scene with its joints closed and none opening."""
+    return scene.replace(state=scene.constraints[0].close(scene, scene.state))
+
+
 def advance_force(index: int, scene: PyTree, t: ArrayLike, dt: ArrayLike) -> PyTree:
     """The scene after a force with memory has seen the step."""
     force, state = scene.forces[index], scene.state
     seen, _ = state.view_for_force(force, scene.mass)
-    force, after = force.advance(t, dt, seen)
+    force, after = force.advance_within(scene, t, dt, seen)
     forces = (*scene.forces[:index], adopt_force(force), *scene.forces[index + 1 :])
     # a force that sees no state of this kind, such as one at the centres of bodies, cannot change it
     return scene.replace(state=after if seen is state else state, forces=forces)
 
 
-__all__ = ["Stage", "advance_force", "prescribe", "resolve_contact"]
+__all__ = ["Stage", "advance_force", "close_joints", "prescribe", "resolve_contact"]

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,12 +11,14 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.checks import concrete_or_none
+from physjax.checks import OptionalNumbers, as_real_quantity, concrete_or_none
 from physjax.constraints.coordinates import Coordinates, Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
 from physjax.parts import Force
+from physjax.vectors import add_leading_axes
 
+C = TypeVar("C", bound="Constraint")
 ORDERS = (2, 4)
 """Orders of the step that holds joints."""
 
@@ -25,13 +27,17 @@ class Constraint(Force):
     """Joints between bodies, held exactly: no force of their own, but the scene's motion is kept on them.
 
     A subclass has `pairs`, indices into the last lane axis, where -1 is the first place in the world, -2 the second and so
-    on; `rows`, how many numbers of a joint must be zero; and `measure`, which says what they are.
+    on; `rows`, how many numbers of a joint must be zero; and `measure`, which says what they are. With `breaks_at` [N], for
+    all or one each, a joint that carries more force at the end of a step is gone from then on; which are `unbroken`,
+    `(*scenes, joints)`, is what it remembers.
     """
 
     couples: ClassVar[bool] = True
     pairs: eqx.AbstractVar[Pairs]
     order: eqx.AbstractVar[int]
     substeps: eqx.AbstractVar[int]
+    breaks_at: eqx.AbstractVar[OptionalNumbers]
+    unbroken: eqx.AbstractVar[Array | None]
 
     @property
     @abstractmethod
@@ -66,6 +72,44 @@ class Constraint(Force):
         from physjax.constraints.reactions import constrain_rate
 
         return constrain_rate(scene, t, state, rate)
+
+    @property
+    def force_rows(self) -> int:
+        """How many of the rows are in metres, so that what they exert is a force: the first ones."""
+        return self.rows
+
+    @property
+    def remembers(self) -> bool:
+        """Whether joints can break."""
+        return self.breaks_at is not None
+
+    def advance(
+        self, t: ArrayLike, dt: ArrayLike, state: PyTree, exerted: Array | None = None
+    ) -> tuple["Constraint", PyTree]:
+        """The joints without those that exert more than `breaks_at`, given what they exert, `(*scenes, joints, rows)`."""
+        if self.breaks_at is None or self.unbroken is None:
+            return self, state
+        if exerted is None:
+            exerted = jnp.zeros((*self.unbroken.shape, self.rows), state.dtype)
+        force = exerted[..., : self.force_rows]
+        # squares, whose derivative exists where nothing pulls
+        limit = add_leading_axes(self.breaks_at, self.unbroken.ndim)
+        unbroken = self.unbroken & (jnp.sum(force * force, axis=-1) <= limit * limit)
+        return eqx.tree_at(lambda part: part.unbroken, self, unbroken), state
+
+    def advance_within(self, scene: PyTree, t: ArrayLike, dt: ArrayLike, state: PyTree) -> tuple["Constraint", PyTree]:
+        """The same, with the forces of all joints of the scene at the end of the step."""
+        from physjax.constraints.reactions import find_forces
+
+        exerted = find_forces(scene, t + dt, scene.state)
+        place = [part is self for part in scene.constraints].index(True)
+        return self.advance(t, dt, state, exerted[place])
+
+    def close(self, scene: PyTree, state: PyTree) -> PyTree:
+        """The state with all joints of the scene closed and none opening, after contacts have moved bodies."""
+        from physjax.constraints.reactions import project_joints
+
+        return project_joints(scene, state)
 
     def find_ends(self, places: Places) -> tuple[Places, Places]:
         """The places of the first and the second end of each joint, given those of the bodies `(numbers, bodies, worlds)`."""
@@ -102,6 +146,28 @@ def demand_order(name: str, order: int) -> int:
     return order
 
 
+def check_limit(breaks_at: ArrayLike | Sequence | None) -> Array | None:
+    """The force [N] at which joints break, if they do."""
+    return None if breaks_at is None else as_real_quantity("breaks_at [N]", breaks_at, above=0.0)
+
+
+def remember_breaks(part: C, state: PyTree) -> C:
+    """The joints as part of a scene, none of them broken unless they are already; a ValueError for limits that do not fit."""
+    if part.breaks_at is None:
+        return part
+    shape = (*state.lanes[:-1], len(part.pairs))
+    limits = part.breaks_at.shape
+    if len(limits) > len(shape) or any(n not in (1, m) for n, m in zip(limits[::-1], shape[::-1], strict=False)):
+        raise ValueError(
+            f"{type(part).__name__}: got breaks_at of shape {limits}, expected () or one for each joint, {shape[-1:]}; swept "
+            f"over scenes (*scenes, {shape[-1]})."
+        )
+    if part.unbroken is not None and part.unbroken.shape == shape:
+        return part
+    whole = jnp.ones(shape, bool)
+    return eqx.tree_at(lambda part: part.unbroken, part, whole, is_leaf=lambda leaf: leaf is None)
+
+
 def demand_closed(part: Constraint, state: PyTree, describe: Callable[[int], str]) -> None:
     """Raise a ValueError for a joint between bodies that are not there, or one that is not closed at the start."""
     bodies = state.lanes[-1] if state.lanes else 0
@@ -127,7 +193,24 @@ def demand_closed(part: Constraint, state: PyTree, describe: Callable[[int], str
 
 @jax.jit
 def _measure_start(part: Constraint, state: PyTree) -> tuple[Array, Array]:
-    return part.measure(*part.find_ends(part.coordinates(state).read_places(state))), part.extent()
+    gap = part.measure(*part.find_ends(part.coordinates(state).read_places(state)))
+    return gap if part.unbroken is None else gap * spread_unbroken(part, gap.shape[-1], gap.dtype)[None], part.extent()
 
 
-__all__ = ["Constraint", "check_joint_pairs", "demand_closed", "demand_order"]
+def spread_unbroken(part: Constraint, worlds: int, dtype: np.dtype) -> Float[Array, "joints worlds"]:
+    """Which joints are unbroken (1) or not (0) in each world."""
+    joints = len(part.pairs)
+    if part.unbroken is None:
+        return jnp.ones((joints, worlds), dtype)
+    return jnp.broadcast_to(part.unbroken.reshape(-1, joints).T, (joints, worlds)).astype(dtype)
+
+
+__all__ = [
+    "Constraint",
+    "check_joint_pairs",
+    "check_limit",
+    "demand_closed",
+    "demand_order",
+    "remember_breaks",
+    "spread_unbroken",
+]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from physjax.constraints.block_solve import Blocks, solve_blocks
-from physjax.constraints.constraint import Constraint
+from physjax.constraints.constraint import Constraint, spread_unbroken
 from physjax.constraints.coordinates import Coordinates, Moves, Places, put_worlds_last
 from physjax.constraints.elimination import Elimination, Pairs, plan_elimination
 
@@ -20,12 +20,16 @@ Rows = Float[Array, "rows joints worlds"]
 
 
 class Mechanism(NamedTuple):
-    """The joints of a scene, how its bodies are read, which of them move (1) or not (0), and the order of elimination."""
+    """The joints of a scene, how its bodies are read, which of them move (1) or not (0), and which bodies joints join.
+
+    `whole` says which joints are unbroken (1) or not (0), None: all of them. The rows of those that broke are zero.
+    """
 
     parts: tuple[Constraint, ...]
     coordinates: Coordinates
     free: Float[Array, "bodies worlds"]
     pairs: Pairs
+    whole: Float[Array, "joints worlds"] | None
 
     @classmethod
     def of(cls, scene: PyTree) -> "Mechanism":
@@ -34,7 +38,11 @@ class Mechanism(NamedTuple):
         lanes, dtype = scene.state.lanes, scene.state.dtype
         free = jnp.ones((), dtype) if scene.held is None else 1 - jnp.asarray(scene.held).astype(dtype)
         pairs = tuple(pair for part in parts for pair in part.pairs)
-        return cls(parts, parts[0].coordinates(scene.state), put_worlds_last(free, lanes), pairs)
+        free, whole = put_worlds_last(free, lanes), None
+        if any(part.unbroken is not None for part in parts):
+            worlds = free.shape[-1]
+            whole = jnp.concatenate([spread_unbroken(part, worlds, dtype) for part in parts])
+        return cls(parts, parts[0].coordinates(scene.state), free, pairs, whole)
 
     @property
     def plan(self) -> Elimination:
@@ -48,12 +56,16 @@ class Mechanism(NamedTuple):
 
     def measure(self, places: Places) -> Rows:
         """By how much each joint is off."""
-        return self._join([part.measure(*part.find_ends(places)) for part in self.parts], 0)
+        gap = self._join([part.measure(*part.find_ends(places)) for part in self.parts], 0)
+        return gap if self.whole is None else gap * self.whole[None]
 
     def differentiate(self, places: Places) -> Jacobian:
         """The Jacobian of `measure`."""
         found = [self._differentiate_part(part, *part.find_ends(places)) for part in self.parts]
-        return jnp.concatenate([self._join(list(ends), 1) for ends in zip(*found, strict=True)], axis=-2)
+        ends = [self._join(list(ends), 1) for ends in zip(*found, strict=True)]
+        if self.whole is not None:
+            ends = [end * self.whole[None, None] for end in ends]
+        return jnp.concatenate(ends, axis=-2)
 
     def _differentiate_part(self, part: Constraint, first: Places, second: Places) -> tuple[Array, Array]:
         move, count = self.coordinates.displace, self.coordinates.freedoms
@@ -95,7 +107,7 @@ class Mechanism(NamedTuple):
         return self.coordinates.apply_mobility(self._at_ends(self.free[None] * mobility)[:, None], jacobian)
 
     def build_matrix(self, jacobian: Jacobian, moved: Jacobian) -> Blocks:
-        """J M⁻¹ Jᵀ, from the Jacobian at one place and M⁻¹Jᵀ there or at another; one for rows that a joint lacks."""
+        """J M⁻¹ Jᵀ, from the Jacobian at one place and M⁻¹Jᵀ there or at another; one for rows that a joint lacks or lost."""
         plan, joints = self.plan, len(self.pairs)
         whole = _contract(jacobian, moved)
         own = whole[..., :joints, :] + whole[..., joints:, :]
@@ -104,6 +116,11 @@ class Mechanism(NamedTuple):
         )
         if lacks.any():
             own = own + (np.eye(self.rows)[..., None] * lacks).astype(own.dtype)[..., None]
+        if self.whole is not None:
+            own = (
+                own
+                + (np.eye(self.rows)[..., None] * ~lacks).astype(own.dtype)[..., None] * (1 - self.whole)[None, None]
+            )
         pad = lambda a: jnp.pad(a, [(0, 0), (0, 0), (0, 1), (0, 0)])  # noqa: E731
         left, right = pad(jacobian), pad(moved)
         pick = lambda a, ends: jnp.take(a, ends, axis=-2, mode="clip")  # noqa: E731

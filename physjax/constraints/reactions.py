@@ -67,11 +67,12 @@ def constraint_forces(scene: PyTree, t: ArrayLike = 0.0, state: PyTree = None) -
         >>> print(constraint_forces(hung)[0].ravel())
         [19.6]
     """
-    return _find_forces(scene, t, scene.state if state is None else state)
+    return find_forces(scene, t, scene.state if state is None else state)
 
 
 @jax.jit
-def _find_forces(scene: PyTree, t: ArrayLike, state: PyTree) -> tuple[Array, ...]:
+def find_forces(scene: PyTree, t: ArrayLike, state: PyTree) -> tuple[Array, ...]:
+    """What `constraint_forces` returns, compiled."""
     mechanism, state = _at_moment(scene, t, state)
     free = scene.replace(forces=tuple(f for f in scene.forces if not isinstance(f, Constraint) or f.response is None))
     _, λ = _find_multipliers(mechanism, scene, state, free.rate(t, state))
@@ -121,4 +122,4 @@ def _solve_impulses(mechanism: Mechanism, mass: PyTree, state: PyTree, jacobian:
     return lax.custom_linear_solve(apply, right, solve, symmetric=True)
 
 
-__all__ = ["constrain_rate", "constraint_forces", "project_joints", "stop_opening"]
+__all__ = ["constrain_rate", "constraint_forces", "find_forces", "project_joints", "stop_opening"]

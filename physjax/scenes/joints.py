@@ -5,7 +5,7 @@ import numpy as np
 
 from physjax.particles import Particles
 from physjax.physics import forces
-from physjax.physics.springs import Rods, Springs
+from physjax.physics.springs import Rods
 from physjax.scene import Scene
 from physjax.scenes.registry import scene
 from physjax.study import energy
@@ -42,7 +42,6 @@ def _build_pendulum(angles: tuple[float, ...], g: float, duration: float) -> Pro
         hung,
         duration=duration,
         conserved=(energy.ENERGY,),
-        looks=Springs(links, stiffness=0.0, rest_length=1.0),
         truths=(
             Truth(
                 "swings as the equations of the angles say [m]", lambda f: _measure_departure(f, angles, g), 0.0, 1e-7
@@ -70,7 +69,6 @@ def heavy_rope(links: int = 20, ratio: float = 1800.0, length: float = 2.0, g: f
         swung,
         duration=1.0,
         conserved=(energy.ENERGY,),
-        looks=Springs(pairs, stiffness=0.0, rest_length=length / links),
         truths=(
             Truth("its links keep their length [m]", lambda f: _measure_links(f, pairs), length / links, 1e-9),
             Truth("hangs straight: the load is at its length [m]", reach, length, 1e-3),
@@ -104,7 +102,6 @@ def chain_bridge(links: int = 30, ratio: float = 100.0, span: float = 8.0, g: fl
     return Problem(
         loaded,
         duration=4.0,
-        looks=Springs(pairs, stiffness=0.0, rest_length=link),
         truths=(
             Truth("its links keep their length [m]", lambda f: _measure_links(f, pairs), link, 1e-9),
             Truth("comes to rest as statics has it [m]", lambda f: f.position[-1] - rest, 0.0, 2e-3),

@@ -13,13 +13,15 @@ from jax.typing import ArrayLike
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.physics.springs.assembly import Lattice
+from physjax.physics.springs.rods import Rods
 from physjax.physics.springs.springs import Springs
 from physjax.show.films import Film, schedule
 from physjax.show.frames import get_faces, take_frames, take_lanes
+from physjax.show.lines import take_lines
 from physjax.show.panels import build_scenery
 from physjax.show.particles import prepare_particles
 from physjax.show.solids import BodyShapes, prepare_bodies
-from physjax.show.spring_lines import build_spring_lines, draw_springs, draw_strain_bar, take_springs
+from physjax.show.spring_lines import build_spring_lines, choose_strain_bar, draw_springs
 from physjax.show.surfaces import draw_surface
 from physjax.show.trails import build_trail_scenery, build_trails
 from physjax.show.view import View, view
@@ -82,14 +84,14 @@ def bodies(
 
 def springs(
     film: Trajectory,
-    sheet: Lattice | Springs,
+    sheet: Lattice | Springs | Rods,
     *,
     scene: int | Sequence[int] | None = None,
     limit: int | float | None = None,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
 ) -> Film:
-    """Springs in the plane or in space, coloured by strain; see `plot.springs`, and `animate.cloth` for the errors.
+    """Springs in the plane or in space, coloured by strain, or rods; see `plot.springs`, and `animate.cloth` for the errors.
 
     Example:
         >>> film = animate.springs(wave, sheet, speed=0.1)
@@ -97,11 +99,11 @@ def springs(
         11
     """
     who = "animate.springs"
-    seen, given, index = take_springs(who, film, sheet, scene)
-    frames, fps = schedule(who, seen, fps, speed)
-    spring_lines = build_spring_lines(who, film, given, index, seen, frames, limit)
-    bar = partial(draw_strain_bar, spring_lines=spring_lines)
-    return Film(build_scenery(seen, frames), frames, fps, partial(draw_springs, spring_lines=spring_lines), bar=bar)
+    lines = take_lines(who, film, sheet, scene)
+    frames, fps = schedule(who, lines.run, fps, speed)
+    spring_lines = build_spring_lines(who, lines, frames, limit)
+    draw = partial(draw_springs, spring_lines=spring_lines)
+    return Film(build_scenery(lines.run, frames), frames, fps, draw, bar=choose_strain_bar(spring_lines))
 
 
 def paths(

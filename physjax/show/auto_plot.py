@@ -1,4 +1,4 @@
-"""A run drawn by what its scene holds: a surface, bodies, springs between nodes, or particles with their paths."""
+"""A run drawn by what its scene holds: a surface, bodies, springs or rods between nodes, or particles with their paths."""
 
 import math
 from typing import TYPE_CHECKING, cast
@@ -7,9 +7,10 @@ import numpy as np
 
 from physjax.physics.rigid.planar import PlanarBodies
 from physjax.show import animate, plot
-from physjax.show.drawables import Bodies, Dots, Lines, Look, PlanarFigures, Surface, choose_drawable, find_default_look
+from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable, find_default_look
 from physjax.show.films import Film
 from physjax.show.frames import take_lanes
+from physjax.show.lines import Lines
 from physjax.show.panels import arrange_panels, build_scenery
 from physjax.trajectory import Trajectory
 

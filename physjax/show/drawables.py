@@ -8,8 +8,10 @@ import numpy as np
 from physjax.physics.rigid.planar import PlanarBodies, PlanarShape
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.physics.springs.assembly import Lattice
+from physjax.physics.springs.rods import Rods
 from physjax.physics.springs.springs import Springs
-from physjax.show.frames import Frames, get_faces, get_springs, take_frames, take_lanes
+from physjax.show.frames import Frames, get_faces, take_frames, take_lanes
+from physjax.show.lines import Lines, take_lines
 from physjax.show.planar import build_planar_outline, check_planar_bodies, find_planar_shapes, list_shapes
 from physjax.show.solids import BodyShapes, Shape, build_inertia_boxes, check_shapes, place_shapes
 from physjax.trajectory import Trajectory
@@ -20,13 +22,6 @@ class Surface(NamedTuple):
 
     run: Frames
     faces: np.ndarray
-
-
-class Lines(NamedTuple):
-    """Nodes and the springs between them: a rope, a bridge, a lattice without its faces."""
-
-    run: Frames
-    springs: Springs
 
 
 class Bodies(NamedTuple):
@@ -63,7 +58,7 @@ class Dots(NamedTuple):
 
 
 Drawable = Surface | Lines | Bodies | PlanarFigures | Dots
-Look = Lattice | Springs | BodyShapes
+Look = Lattice | Springs | Rods | BodyShapes
 """What a user may say that a run is drawn as."""
 
 
@@ -74,11 +69,11 @@ def choose_drawable(
     scene: int | Sequence[int] | None = None,
     dims: tuple[int, ...] = (3,),
 ) -> Drawable:
-    """What a film is drawn as by `shown`: a lattice with faces, springs, a lattice of them, a `Shape` or one for each body.
+    """What a film is drawn as by `shown`: a lattice with faces, springs, rods, a lattice, a `Shape` or one for each body.
 
     Without it bodies are boxes of their own inertia, in the plane the shapes of the scene's `Solids`; nodes are joined by
-    the springs of the scene, and all else is dots. Of a batch of scenes `scene` picks one. Raises TypeError or ValueError
-    for what does not fit.
+    the springs or the rods of the scene, and all else is dots. Of a batch of scenes `scene` picks one. Raises TypeError or
+    ValueError for what does not fit.
     """
     if shown is None and isinstance(film, Trajectory) and film.scene is not None and film.state is not None:
         shown = find_default_look(film)
@@ -101,12 +96,11 @@ def choose_drawable(
     if isinstance(shown, Lattice) and len(shown.faces):
         faces, nodes = get_faces(who, shown)
         return Surface(take_frames(who, film, scene=scene, nodes=nodes, dims=dims), faces)
-    given = get_springs(who, shown)
-    return Lines(take_frames(who, film, scene=scene, nodes=given.nodes, dims=dims), given)
+    return take_lines(who, film, shown, scene, dims)
 
 
 def find_default_look(film: Trajectory) -> Look | None:
-    """What the scene of a film is drawn as: boxes for bodies, in the plane their shapes, springs not on a line, or None."""
+    """What the scene of a film is drawn as: boxes for bodies, in the plane shapes, springs or rods not on a line, or None."""
     scene = film.scene
     if scene is None:
         return None
@@ -114,8 +108,9 @@ def find_default_look(film: Trajectory) -> Look | None:
         return build_inertia_boxes("find_default_look", film)
     if isinstance(film.state, PlanarBodies):
         return find_planar_shapes(film)
-    springs = [force for force in scene.forces if isinstance(force, Springs)]
-    return springs[0] if springs and film.position.shape[-1] > 1 else None
+    if film.position.shape[-1] == 1:
+        return None
+    return next((force for kind in (Springs, Rods) for force in scene.forces if isinstance(force, kind)), None)
 
 
 def _build_sheet(shape: PlanarShape) -> Shape:

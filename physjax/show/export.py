@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from physjax.files import write_atomically, write_folder_atomically
-from physjax.show.drawables import Bodies, Dots, Lines, Look, PlanarFigures, Surface, choose_drawable
+from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
-from physjax.show.frames import Frames, find_batch_index, find_intact_springs
+from physjax.show.frames import Frames
 from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document, Json
+from physjax.show.lines import Lines
 from physjax.show.pages import check_output_path
 from physjax.text import progress_bar
 from physjax.trajectory import Trajectory
@@ -71,7 +72,7 @@ def gltf(
     place = _require_finite_positions(who, seen.run, frames)
     if not isinstance(seen, Bodies):
         _check_morph_size(who, place)
-    if isinstance(seen, Lines) and _any_spring_breaks(who, film, seen, scene, frames):
+    if isinstance(seen, Lines) and seen.held is not None and not seen.held[frames].all():
         raise ValueError(
             f"{who}: got springs that break, expected intact ones: glTF cannot remove a line. export.ply writes "
             "those that are intact."
@@ -115,7 +116,7 @@ def ply(
     seen = seen.solids() if isinstance(seen, PlanarFigures) else seen
     seen = seen.surface() if isinstance(seen, Bodies) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
-    held = _find_intact(who, film, seen, scene) if isinstance(seen, Lines) else None
+    held = seen.held if isinstance(seen, Lines) else None
     digits = max(4, len(str(len(frames))))
     names = [f"frame_{number:0{digits}d}.ply" for number in range(len(frames))]
     with write_folder_atomically(folder) as inside:
@@ -150,7 +151,7 @@ def _add_morphing(
     if isinstance(seen, Surface):
         what |= {"mode": TRIANGLES, "indices": document.indices(seen.faces)}
     elif isinstance(seen, Lines):
-        what |= {"mode": LINES, "indices": document.indices(seen.springs.pairs)}
+        what |= {"mode": LINES, "indices": document.indices(seen.pairs)}
     what["targets"] = [{"POSITION": document.vertices(place - first)} for place in others]
     node = document.node(name="run", mesh=document.mesh(what, weights=[0.0] * len(others)))
     weights = np.eye(len(others) + 1)[:, 1:]
@@ -167,8 +168,7 @@ def _encode_ply(seen: Surface | Lines | Dots, place: np.ndarray, held: np.ndarra
         table["count"], table["corners"] = 3, seen.faces
         tables = [f"element face {len(table)}", "property list uchar int vertex_indices"]
     elif isinstance(seen, Lines):
-        pairs = seen.springs.pairs
-        table = np.asarray(pairs if held is None else pairs[held], "<i4")
+        table = np.asarray(seen.pairs if held is None else seen.pairs[held], "<i4")
         tables = [f"element edge {len(table)}", "property int vertex1", "property int vertex2"]
     else:
         vertices, table = vertices[np.isfinite(vertices).all(axis=-1)], np.empty(0)
@@ -201,18 +201,6 @@ def _check_morph_size(who: str, place: np.ndarray) -> None:
             f"{who}: got {frames} frames of {nodes} nodes, {12e-6 * frames * nodes:.3g} MB, expected at most {MAX_MORPH_TARGETS} "
             f"frames and {MAX_MORPH_BYTES / 1e6:.0f} MB of morph targets. Choose a lower fps=, a higher speed=, or export.ply."
         )
-
-
-def _find_intact(who: str, film: Trajectory, seen: Lines, scene: int | Sequence[int] | None) -> np.ndarray | None:
-    """Which springs are intact at every frame, `(frames, springs)`; None where none can break."""
-    return find_intact_springs(who, film, seen.springs, find_batch_index(who, film, scene))
-
-
-def _any_spring_breaks(
-    who: str, film: Trajectory, seen: Lines, scene: int | Sequence[int] | None, frames: list[int]
-) -> bool:
-    held = _find_intact(who, film, seen, scene)
-    return held is not None and not held[frames].all()
 
 
 def _align_quaternion_signs(q: np.ndarray) -> np.ndarray:

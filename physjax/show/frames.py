@@ -7,7 +7,6 @@ import numpy as np
 
 from physjax.parts import Contact
 from physjax.physics.springs.assembly import Lattice
-from physjax.physics.springs.springs import Springs
 from physjax.trajectory import Trajectory
 
 DAY_SECONDS = 86400.0
@@ -125,31 +124,6 @@ def pick_frames(who: str, run: Frames, frames: int | Iterable[int] | None, defau
                 f"{run.good_frames - 1}, the last good one. film.first_bad_step says when it happened; try a smaller dt."
             )
     return [int(frame) % count for frame in asked]
-
-
-def get_springs(who: str, given: object) -> Springs:
-    """The springs of a lattice, or those given themselves; a TypeError for anything else."""
-    springs = given.springs if isinstance(given, Lattice) else given
-    if not isinstance(springs, Springs):
-        raise TypeError(
-            f"{who}: got {type(given).__name__}, expected springs.Springs or a lattice that has them, such as "
-            "lattices.bridge(...)."
-        )
-    return springs
-
-
-def find_intact_springs(who: str, film: Trajectory, springs: Springs, index: tuple[int, ...]) -> np.ndarray | None:
-    """Which springs are intact at every frame, `(frames, springs)`, as the run recorded; None where none can break."""
-    if springs.breaks_at is None:
-        return None
-    for part in film.parts:
-        if isinstance(part, Springs) and part.topology == springs.topology:
-            held = np.asarray(part.unbroken)
-            return held[(slice(None), *index[: held.ndim - 2])]
-    raise ValueError(
-        f"{who}: got a film without a record of which of these springs broke, expected one of a scene with them "
-        "among its forces. If it was loaded from a file, load it with scene=."
-    )
 
 
 def get_faces(who: str, sheet: Lattice) -> tuple[np.ndarray, int]:

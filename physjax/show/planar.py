@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from physjax.physics.rigid.body_joints import BodyJoints
 from physjax.physics.rigid.planar import PlanarBodies, PlanarShape, Solids
 from physjax.show.frames import Frames, take_lanes
 from physjax.show.panels import Scenery
@@ -21,6 +23,10 @@ CIRCLE_CORNERS = 48
 """Corners of the polygon that is drawn for a circle."""
 POINTER_SHARE = 0.05
 """Length of the line through a body without a shape, as a share of the box around the run."""
+BAR_RADIUS_SHARE = 0.08
+"""Radius of a bar that stands for a body with joints and without a shape, as a share of half its length."""
+LONE_DISC_RADIUS = 0.05
+"""Radius [m] of a disc that stands for a body without a shape that no joint is away from."""
 EDGE_BRIGHTNESS = 0.45
 """Of an edge or a line on a body, as a share of that of its area."""
 
@@ -83,14 +89,27 @@ def turn_vectors(angle: ArrayLike, vectors: np.ndarray) -> np.ndarray:
 
 
 def find_planar_shapes(film: Trajectory) -> list[PlanarShape] | None:
-    """The shapes that the `Solids` of a run's scene give its bodies, one for each; None for other runs."""
+    """The shapes that the `Solids` of a run's scene give its bodies, one for each, or bars from joint to joint; else None."""
     scene = film.scene
-    solids = [] if scene is None else [contact for contact in scene.contacts if isinstance(contact, Solids)]
-    if not solids or scene is None:
+    if scene is None:
         return None
-    *worlds, bodies = scene.state.lanes
-    shapes = list(solids[0].shapes)
+    *worlds, bodies = scene.state.lanes or (1,)
+    solids = [contact for contact in scene.contacts if isinstance(contact, Solids)]
+    joints = [part for part in scene.constraints if isinstance(part, BodyJoints)]
+    if not solids and not joints:
+        return None
+    shapes = list(solids[0].shapes) if solids else [_build_bar(joints, body) for body in range(bodies)]
     return (shapes * bodies if len(shapes) == 1 else shapes) * int(np.prod(worlds, dtype=int))
+
+
+def _build_bar(joints: Sequence[BodyJoints], body: int) -> PlanarShape:
+    """A bar about the centre of mass of a body without a shape, as long as its farthest joint is away; a disc without one."""
+    points = np.concatenate([np.asarray(part.points, float)[np.asarray(part.pairs) == body] for part in joints])
+    reach = np.hypot(*points.T)
+    if not reach.max(initial=0.0) > 0:
+        return PlanarShape.disc(LONE_DISC_RADIUS)
+    end = points[np.argmax(reach)]
+    return PlanarShape(jnp.asarray([-end, end]), jnp.asarray(BAR_RADIUS_SHARE * reach.max()))
 
 
 def take_planar_bodies(

@@ -1,6 +1,6 @@
-"""Springs as lines, coloured by their strain."""
+"""Springs as lines, coloured by their strain, and rods as grey ones."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
@@ -9,7 +9,8 @@ import numpy as np
 from physjax.physics.springs.assembly import Lattice
 from physjax.physics.springs.rods import Rods
 from physjax.physics.springs.springs import Springs
-from physjax.show.frames import Frames, find_batch_index, find_intact_springs, get_springs, pick_frames, take_frames
+from physjax.show.frames import pick_frames
+from physjax.show.lines import Lines, take_lines
 from physjax.show.panels import Scenery, build_scenery, draw_colour_bar, draw_panels
 from physjax.trajectory import Trajectory
 
@@ -28,23 +29,23 @@ MAX_BLOWN_UP_STRAIN = 1.0
 """The largest strain that has a colour in a run that blew up: a spring of twice its length."""
 MIN_STRAIN_LIMIT = 0.01
 """The largest strain that has a colour where no spring is stretched at all."""
-ROUNDING_STRAIN = 1e-8
-"""A strain below this is rounding, as that of rods: it has no colour."""
 
 
 class SpringLines(NamedTuple):
     """How springs are drawn: pairs of nodes, rest lengths [m], which are intact, and the strain at which the colours end.
 
-    `held` `(frames, springs)` says which are intact at each frame; None: all of them.
+    `held` `(frames, springs)` says which are intact at each frame; None: all of them. Rods have no rest lengths and no strain.
     """
 
     pairs: np.ndarray
-    rest: np.ndarray
+    rest: np.ndarray | None
     held: np.ndarray | None
     limit: float
 
     def strain(self, position: np.ndarray) -> np.ndarray:
-        """(l - L)/L for `(..., nodes, dim)` positions; infinite for a spring without rest length."""
+        """(l - L)/L for `(..., nodes, dim)` positions; infinite for a spring without rest length, zero for rods."""
+        if self.rest is None:
+            return np.zeros((*position.shape[:-2], len(self.pairs)))
         line = position[..., self.pairs[:, 1], :] - position[..., self.pairs[:, 0], :]
         length = np.sqrt((line * line).sum(axis=-1))
         has_rest = self.rest > 0
@@ -80,65 +81,24 @@ def springs(
         3
     """
     who = "plot.springs"
-    seen, given, index = take_springs(who, film, sheet, scene)
-    chosen = pick_frames(who, seen, frames)
-    spring_lines = build_spring_lines(who, film, given, index, seen, chosen, limit)
-    bar = partial(draw_strain_bar, spring_lines=spring_lines)
-    return draw_panels(
-        build_scenery(seen, chosen), chosen, partial(draw_springs, spring_lines=spring_lines), figure, bar
-    )
+    lines = take_lines(who, film, sheet, scene)
+    chosen = pick_frames(who, lines.run, frames)
+    spring_lines = build_spring_lines(who, lines, chosen, limit)
+    draw = partial(draw_springs, spring_lines=spring_lines)
+    return draw_panels(build_scenery(lines.run, chosen), chosen, draw, figure, choose_strain_bar(spring_lines))
 
 
-def take_springs(
-    who: str, film: Trajectory, sheet: Lattice | Springs | Rods, scene: int | Sequence[int] | None
-) -> tuple[Frames, Springs, tuple[int, ...]]:
-    """The film of one scene, the springs in it, and the place of that scene in a batch."""
-    if isinstance(sheet, Rods):
-        seen = take_frames(who, film, scene=scene)
-        return seen, _build_lines_of_rods(who, sheet, seen.position[0]), find_batch_index(who, film, scene)
-    given = get_springs(who, sheet)
-    seen = take_frames(who, film, scene=scene, nodes=given.nodes)
-    return seen, given, find_batch_index(who, film, scene)
-
-
-def _build_lines_of_rods(who: str, rods: Rods, position: np.ndarray) -> Springs:
-    """Springs where rods join two particles, as long as at the start: an anchor is no node, and its rod is not drawn."""
-    pairs = np.array([pair for pair in rods.pairs if min(pair) >= 0]).reshape(-1, 2)
-    if not len(pairs) or pairs.max() >= len(position):
-        raise ValueError(
-            f"{who}: got rods {rods.pairs} and {len(position)} nodes, expected rods between them. Pivots that are drawn are "
-            "pinned particles."
-        )
-    line = position[pairs[:, 1]] - position[pairs[:, 0]]
-    return Springs(pairs, 0.0, np.sqrt((line * line).sum(axis=-1)), nodes=len(position))
-
-
-def build_spring_lines(
-    who: str,
-    film: Trajectory,
-    given: Springs,
-    index: tuple[int, ...],
-    run: Frames,
-    frames: Sequence[int],
-    limit: int | float | None,
-) -> SpringLines:
-    """How the springs of the scene `index` of a batch are drawn; the colours end at `limit`, or fit the given frames."""
-    held = find_intact_springs(who, film, given, index)
-    rest = np.broadcast_to(_select_scene(np.asarray(given.rest_length, float), index), len(given.pairs))
-    spring_lines = SpringLines(given.pairs, rest, held, 1.0)
+def build_spring_lines(who: str, lines: Lines, frames: Sequence[int], limit: int | float | None = None) -> SpringLines:
+    """How lines are drawn; the colours end at `limit`, or fit the given frames."""
+    spring_lines = SpringLines(lines.pairs, lines.rest, lines.held, MIN_STRAIN_LIMIT)
+    if limit is None and lines.rest is None:
+        return spring_lines
     if limit is None:
-        most = [_strain_percentile(spring_lines, run.position[frame].astype(float), frame) for frame in frames]
-        limit = min(max(most), MAX_BLOWN_UP_STRAIN if run.blew_up else np.inf)
-        limit = limit if limit > ROUNDING_STRAIN else MIN_STRAIN_LIMIT
+        most = [_strain_percentile(spring_lines, lines.run.position[frame].astype(float), frame) for frame in frames]
+        limit = min(max(most), MAX_BLOWN_UP_STRAIN if lines.run.blew_up else np.inf) or MIN_STRAIN_LIMIT
     elif not limit > 0:
         raise ValueError(f"{who}: got limit={limit}, expected a strain > 0, e.g. 0.05 for five per cent.")
     return spring_lines._replace(limit=float(limit))
-
-
-def _select_scene(numbers: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
-    """The numbers for the springs of one scene: the same for all scenes, or with axes of scenes in front."""
-    axes = max(numbers.ndim - 1, 0)
-    return numbers[tuple(i if n > 1 else 0 for i, n in zip(index[len(index) - axes :], numbers.shape, strict=False))]
 
 
 def _strain_percentile(spring_lines: SpringLines, position: np.ndarray, frame: int) -> float:
@@ -165,9 +125,11 @@ def draw_springs(ax: "Axes", scenery: Scenery, frame: int, *, spring_lines: Spri
     return [*drawn, *scenery.draw_solids(ax, frame)]
 
 
-def draw_strain_bar(figure: "Figure", where: dict[str, Any], *, spring_lines: SpringLines) -> None:
-    """The colour bar of the strains, below all panels."""
-    draw_colour_bar(figure, where, spring_lines.colours(), "strain [%]", extend="both")
+def choose_strain_bar(spring_lines: SpringLines) -> "Callable[[Figure, dict[str, Any]], None] | None":
+    """What draws the colour bar of the strains, below all panels; None for rods."""
+    if spring_lines.rest is None:
+        return None
+    return lambda figure, where: draw_colour_bar(figure, where, spring_lines.colours(), "strain [%]", extend="both")
 
 
 def _build_collection(ends: np.ndarray, **style: Any) -> "LineCollection | Line3DCollection":

@@ -17,10 +17,10 @@ from jax.typing import ArrayLike
 
 from physjax.physics.rigid.planar import PlanarBodies
 from physjax.show import obstacles
-from physjax.show.drawables import Bodies, Dots, Lines, Look, PlanarFigures, Surface, choose_drawable
+from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
 from physjax.show.flat_page import describe_flat_obstacle, pack_flat_bodies, take_flat_bodies
-from physjax.show.frames import find_batch_index
+from physjax.show.lines import Lines
 from physjax.show.page_data import (
     QUANTISATION_STEPS,
     Json,
@@ -93,8 +93,8 @@ def view(
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
     lines coloured by strain, a `solids` shape or one for each body, in the plane a `rigid.PlanarShape`. Without it bodies
-    are boxes of their inertia or the shapes of the scene's `rigid.Solids`, nodes are joined by the scene's springs, and
-    everything else is dots with their paths. `color` is one for surfaces and bodies, a value for each lane for dots and
+    are boxes of their inertia or the shapes of the scene's `rigid.Solids`, nodes are joined by the scene's springs or rods,
+    and everything else is dots with their paths. `color` is one for surfaces and bodies, a value for each lane for dots and
     bodies in the plane. The page plays `speed` seconds of the run a second, in `fps`
     frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
@@ -122,7 +122,7 @@ def view(
     elif isinstance(seen, Bodies):
         part = _describe_bodies(seen, scenery, frames, color)
     elif isinstance(seen, Lines):
-        part = _describe_lines(who, film, seen, find_batch_index(who, film, scene), scenery, frames)
+        part = _describe_lines(who, seen, scenery, frames)
     else:
         part = _describe_dots(who, cast("Dots", seen), scenery, frames, color)
     describe = describe_flat_obstacle if scenery.flat else describe_obstacle
@@ -170,11 +170,9 @@ def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: "
     }
 
 
-def _describe_lines(
-    who: str, film: Trajectory, seen: Lines, index: tuple[int, ...], scenery: Scenery, frames: list[int]
-) -> Json:
-    """Springs in the colours of their strain; broken ones are grey."""
-    spring_lines = build_spring_lines(who, film, seen.springs, index, seen.run, frames, None)
+def _describe_lines(who: str, seen: Lines, scenery: Scenery, frames: list[int]) -> Json:
+    """Springs in the colours of their strain, rods without a limit of it; broken ones are grey."""
+    spring_lines = build_spring_lines(who, seen, frames)
     position = seen.run.position[frames].astype(float)
     bar = spring_lines.colours()
     shade = np.clip((spring_lines.strain(position) / spring_lines.limit + 1) / 2, 0, 1)
@@ -187,7 +185,7 @@ def _describe_lines(
         "shades": pack_frames(np.round(shade * (COLOUR_COUNT - 1)).astype(np.uint8)),
         "held": pack_frames(held.astype(np.uint8)),
         "ramp": (bar.cmap(np.linspace(0, 1, COLOUR_COUNT))[:, :3] * 255).round().astype(int).tolist(),
-        "limit": 100 * spring_lines.limit,
+        "limit": None if spring_lines.rest is None else 100 * spring_lines.limit,
     }
 
 

@@ -37,7 +37,7 @@ from physjax.vectors import add_trailing_axes, norm
 
 MAX_FRAMES_PER_STEP = 64
 """The longest step where none is given, relative to dt: a path without any error would be left in one."""
-LATE_STAGES = ("resolve contacts", "advance memory")
+LATE_STAGES = ("resolve contacts", "close joints", "advance memory")
 """What is done at the end of a step, whenever in it it was due."""
 WHOLE_AND_HALVES = ((0.0, 1.0), (0.0, 0.5), (0.5, 0.5))
 """Start and length of the three steps of an attempt, relative to it."""

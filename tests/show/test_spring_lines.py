@@ -6,7 +6,22 @@ import pytest
 from matplotlib.collections import LineCollection
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from physjax import Particles, Scene, Trajectory, forces, lattices, methods, plot, simulate, springs
+from physjax import (
+    Particles,
+    Scene,
+    Trajectory,
+    animate,
+    forces,
+    inertia,
+    lattices,
+    methods,
+    plot,
+    rigid,
+    simulate,
+    springs,
+)
+from physjax.show import auto_plot
+from physjax.show.drawables import choose_drawable, find_default_look
 from physjax.show.spring_lines import SpringLines
 
 
@@ -114,7 +129,7 @@ def test_a_film_must_remember_what_broke(ruin, tmp_path, unannotated):
         plot.springs(Trajectory.load(tmp_path / "film.npz"), sheet)
     again = Trajectory.load(tmp_path / "film.npz", scene=film.scene)
     assert layers(plot.springs(again, sheet, -1).axes[0])[1] is not None
-    with pytest.raises(TypeError, match=r"got ndarray, expected springs\.Springs or a lattice"):
+    with pytest.raises(TypeError, match=r"got ndarray, expected springs\.Springs, springs\.Rods or a lattice"):
         plot.springs(film, sheet.springs.pairs)
     with pytest.raises(ValueError, match="expected a strain > 0"):
         plot.springs(film, sheet, limit=-1.0)
@@ -128,12 +143,26 @@ def test_springs_on_a_line_are_refused():
         plot.springs(film, tie)
 
 
-def test_rods_are_lines_without_a_strain_and_anchors_are_not_drawn():
+def test_rods_are_lines_without_a_strain_by_default_and_reach_their_anchors():
     x = np.array([[0.5, -0.5], [1.0, -1.5], [2.0, -1.0]])
     rods = springs.Rods([(-1, 0), (0, 1), (1, 2)], anchors=[(0.0, 0.0)])
     film = simulate(Scene(Particles(x, np.zeros((3, 2))), forces=(rods,)), methods.verlet, dt=0.01, steps=1)
-    panel, bar = plot.springs(film, rods, -1).axes
-    assert len(layers(panel)[0].get_segments()) == 2
-    assert bar.get_xlim() == pytest.approx((-1.0, 1.0))
-    with pytest.raises(ValueError, match="Pivots that are drawn are pinned particles"):
-        plot.springs(film, springs.Rods([(-1, 0)], anchors=[(0.0, 0.0)]))
+    assert find_default_look(film) is film.scene.forces[0]
+    (panel,) = auto_plot.plot_run(film).axes
+    lines = layers(panel)[0].get_segments()
+    np.testing.assert_allclose(lines, [[(0.0, 0.0), x[0]], x[:2], x[1:]], atol=1e-12)
+    drawn = choose_drawable("a test", film, None, dims=(2, 3))
+    assert drawn.run.position.shape == (2, 4, 2)
+    page = animate.view(film, speed=0.1).page()
+    assert '"limit":null' in page  # rods have no bar of colours
+    with pytest.raises(ValueError, match=r"got rods .* and 3 nodes, expected rods between them"):
+        plot.springs(film, springs.Rods([(2, 3)]))
+
+
+def test_bodies_without_a_shape_are_bars_between_their_joints():
+    plate = inertia.planar_plate(1.0, (1.0, 0.2))
+    nail = rigid.Joints([(-1, 0)], [[[0.0, 0.0], [-0.5, 0.0]]])
+    hung = Scene(rigid.planar_bodies(plate, [[0.5, 0.0]]), plate, (nail,))
+    film = simulate(hung, methods.verlet, dt=0.01, steps=1)
+    (bar,) = find_default_look(film)
+    np.testing.assert_allclose(bar.corners, [[0.5, 0.0], [-0.5, 0.0]])

@@ -151,7 +151,7 @@ def test_what_does_not_fit_is_refused_in_plain_words(drape, swarm, tmp_path):
     line = simulate(Scene(Particles(jnp.zeros((2, 1)), jnp.ones((2, 1)))), methods.verlet, dt=0.1, steps=2)
     with pytest.raises(ValueError, match="got positions with 1 component, expected 2 or 3"):
         animate.view(line)
-    with pytest.raises(TypeError, match=r"animate.view: got str, expected springs.Springs or a lattice"):
+    with pytest.raises(TypeError, match=r"animate.view: got str, expected springs.Springs, springs.Rods or a lattice"):
         animate.view(run, "cloth")
     with pytest.raises(TypeError, match="expected RigidBodies"):
         animate.view(run, solids.sphere(1.0))

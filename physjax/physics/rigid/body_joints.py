@@ -1,6 +1,7 @@
 """What all exact joints between bodies have in common: two points that they join, and how these are read."""
 
 from collections.abc import Sequence
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from physjax.checks import as_real_quantity
-from physjax.constraints.constraint import Constraint, check_joint_pairs, demand_closed
+from physjax.constraints.constraint import Constraint, check_joint_pairs, demand_closed, remember_breaks
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
@@ -59,7 +60,7 @@ class BodyJoints(Constraint, Load):
         points = jnp.moveaxis(self.points, 0, 2)[..., None]
         return self.reader.place_points(first, points[0]), self.reader.place_points(second, points[1])
 
-    def prepare(self, state: PyTree, mass: PyTree) -> "BodyJoints":
+    def prepare(self, state: PyTree, mass: PyTree) -> Self:
         """The joints as part of a scene, closed at its start; a ValueError where they cannot be."""
         name, dim = type(self).__name__, self.coordinates(state).dim
         if self.points.shape[-1] != dim:
@@ -70,8 +71,9 @@ class BodyJoints(Constraint, Load):
             raise ValueError(
                 f"{name}: got bodies on a pivot, expected free ones. Join a point of theirs to the world, -1."
             )
-        demand_closed(self, state, lambda joint: f"the joint {joint} of {self.pairs[joint]}")
-        return self
+        joints = remember_breaks(self, state)
+        demand_closed(joints, state, lambda joint: f"the joint {joint} of {self.pairs[joint]}")
+        return joints
 
 
 def check_joints(

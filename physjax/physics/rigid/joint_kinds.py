@@ -1,12 +1,13 @@
 """Exact joints between bodies other than ball joints: welds, hinges, sliders and rods."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import (
     OptionalNumbers,
@@ -16,7 +17,7 @@ from physjax.checks import (
     quantity,
     unchecked_quantity,
 )
-from physjax.constraints.constraint import demand_order
+from physjax.constraints.constraint import check_limit, demand_order
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.physics.rigid.body_joints import (
@@ -32,7 +33,7 @@ from physjax.physics.rigid.body_joints import (
 class Welds(BodyJoints):
     """A point of each of two bodies stays at that of the other, and they do not turn relative to how they start.
 
-    For `pairs`, `points`, `order` and `substeps` see `Joints`.
+    For `pairs`, `points`, `order`, `substeps` and `breaks_at` see `Joints`.
 
     Example:
         >>> plate = inertia.planar_plate(1.0, (1.0, 0.2))
@@ -47,16 +48,32 @@ class Welds(BodyJoints):
     turns: Float[Array, "..."] | None = unchecked_quantity("turn at the start", "rad", per="joint", default=None)
     order: int = eqx.field(static=True, default=2)
     substeps: int = eqx.field(static=True, default=1)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
-    def __init__(self, pairs: ArrayLike | Sequence, points: ArrayLike | Sequence, *, order: int = 2, substeps: int = 1):
+    def __init__(
+        self,
+        pairs: ArrayLike | Sequence,
+        points: ArrayLike | Sequence,
+        *,
+        order: int = 2,
+        substeps: int = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
+    ):
         self.pairs, self.points = check_joints("Welds", pairs, points)
         self.order, self.substeps = demand_order("Welds", order), as_positive_integer("substeps", substeps)
+        self.breaks_at, self.unbroken = check_limit(breaks_at), None
         self.turns = None
 
     @property
     def rows(self) -> int:
         """Directions and angles: 3 in the plane, 6 in space."""
         return 3 if self.points.shape[-1] == 2 else 6
+
+    @property
+    def force_rows(self) -> int:
+        """The directions."""
+        return self.points.shape[-1]
 
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
         """From the first point to the second [m], and by how much the bodies have turned [rad]."""
@@ -86,6 +103,8 @@ class Hinges(BodyJoints):
     axis: Float[Array, "joints 2 3"] = unchecked_quantity("axis", "1", kind="vector", per=None)
     order: int = eqx.field(static=True, default=2)
     substeps: int = eqx.field(static=True, default=1)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -95,6 +114,7 @@ class Hinges(BodyJoints):
         *,
         order: int = 2,
         substeps: int = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Hinges", pairs, points)
         if self.points.shape[-1] == 2:
@@ -104,11 +124,17 @@ class Hinges(BodyJoints):
         axis = _check_axis("Hinges", axis, len(self.pairs), 3)
         self.axis = jnp.broadcast_to(axis if axis.ndim == 3 else axis[:, None], self.points.shape)
         self.order, self.substeps = demand_order("Hinges", order), as_positive_integer("substeps", substeps)
+        self.breaks_at, self.unbroken = check_limit(breaks_at), None
 
     @property
     def rows(self) -> int:
         """Three directions and two angles."""
         return 5
+
+    @property
+    def force_rows(self) -> int:
+        """The directions."""
+        return 3
 
     def measure(self, first: Places, second: Places) -> Float[Array, "5 joints worlds"]:
         """From the first point to the second [m], and the cosines of the first axis across the second."""
@@ -138,6 +164,8 @@ class Sliders(BodyJoints):
     turns: Float[Array, "..."] | None = unchecked_quantity("turn at the start", "rad", per="joint", default=None)
     order: int = eqx.field(static=True, default=2)
     substeps: int = eqx.field(static=True, default=1)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -147,17 +175,24 @@ class Sliders(BodyJoints):
         *,
         order: int = 2,
         substeps: int = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Sliders", pairs, points)
         dim = self.points.shape[-1]
         self.axis = jnp.broadcast_to(_check_axis("Sliders", axis, len(self.pairs), dim), (len(self.pairs), dim))
         self.order, self.substeps = demand_order("Sliders", order), as_positive_integer("substeps", substeps)
+        self.breaks_at, self.unbroken = check_limit(breaks_at), None
         self.turns = None
 
     @property
     def rows(self) -> int:
         """All but one of the ways to move: 2 in the plane, 5 in space."""
         return 2 if self.points.shape[-1] == 2 else 5
+
+    @property
+    def force_rows(self) -> int:
+        """The directions across the axis."""
+        return self.points.shape[-1] - 1
 
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
         """From the first point to the second across the axis [m], and by how much the bodies have turned [rad]."""
@@ -189,6 +224,8 @@ class Rods(BodyJoints):
     length: OptionalNumbers = quantity("length", "m", per="joint", above=0, default=None)
     order: int = eqx.field(static=True, default=2)
     substeps: int = eqx.field(static=True, default=1)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -198,10 +235,12 @@ class Rods(BodyJoints):
         *,
         order: int = 2,
         substeps: int = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Rods", pairs, points)
         self.length = None if length is None else as_real_quantity("length [m]", length, above=0.0)
         self.order, self.substeps = demand_order("Rods", order), as_positive_integer("substeps", substeps)
+        self.breaks_at, self.unbroken = check_limit(breaks_at), None
 
     @property
     def rows(self) -> int:
@@ -223,8 +262,7 @@ class Rods(BodyJoints):
                 "distance between the points of rods [m]", _measure_distances(self, state), above=0.0
             )
             rods = eqx.tree_at(lambda rods: rods.length, self, length, is_leaf=lambda leaf: leaf is None)
-        BodyJoints.prepare(rods, state, mass)
-        return rods
+        return cast("Rods", BodyJoints.prepare(rods, state, mass))
 
 
 @jax.jit
@@ -247,8 +285,7 @@ def _remember_turns(part: PyTree, state: PyTree, mass: PyTree) -> PyTree:
     if part.turns is None and part.points.shape[-1] == part.coordinates(state).dim:
         turns = measure_turns(part, state)
         part = eqx.tree_at(lambda part: part.turns, part, turns, is_leaf=lambda leaf: leaf is None)
-    BodyJoints.prepare(part, state, mass)
-    return part
+    return BodyJoints.prepare(part, state, mass)
 
 
 def _check_axis(name: str, axis: ArrayLike | Sequence, joints: int, dim: int) -> Array:

@@ -1,13 +1,13 @@
 """Ball joints between rigid bodies: exact, or stiff damped springs between points that should coincide."""
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import (
     Numbers,
@@ -17,7 +17,7 @@ from physjax.checks import (
     quantity,
     unchecked_quantity,
 )
-from physjax.constraints.constraint import demand_order
+from physjax.constraints.constraint import check_limit, demand_order
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
@@ -33,7 +33,8 @@ class Joints(BodyJoints):
 
     `pairs` `(joints, 2)` are indices into the last lane axis, -1 for the world; `points` `(joints, 2, dim)` are places [m] in the
     frames of the two bodies, from their centers of mass. Without a stiffness joints are exact, as `springs.Rods` are, with
-    the same `order` and `substeps`: they add no stiffness, open by no load, and `constraint_forces` gives their forces.
+    the same `order`, `substeps` and `breaks_at`: they add no stiffness, open by no load, and `constraint_forces` gives their
+    forces.
 
     With a `stiffness` k [N/m] and a `damping` c [kg/s], shared or per joint, they are springs between bodies in space,
     F = k d + c ḋ, with d from the first point to the second: the points separate by about load/k, and a step must resolve
@@ -56,6 +57,8 @@ class Joints(BodyJoints):
     damping: Numbers = quantity("damping c", "kg/s", per="joint", at_least=0, default=0.0)
     order: int = eqx.field(static=True, default=2)
     substeps: int = eqx.field(static=True, default=1)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -66,11 +69,15 @@ class Joints(BodyJoints):
         *,
         order: int = 2,
         substeps: int = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Joints", pairs, points)
         self.stiffness = None if stiffness is None else as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
         self.order, self.substeps = demand_order("Joints", order), as_positive_integer("substeps", substeps)
+        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        if self.stiffness is not None and breaks_at is not None:
+            raise ValueError("Joints: got a stiffness and breaks_at, expected one of them: springs do not break.")
         if self.stiffness is not None and (np.asarray(self.pairs) < 0).any():
             raise ValueError(
                 "Joints: got the world, -1, and a stiffness; springs to the world are AtPoint(point, Anchor(...))."
@@ -90,11 +97,9 @@ class Joints(BodyJoints):
         """From the first point to the second [m]."""
         return jnp.stack(subtract_points(self.place_ends(first, second)))
 
-    def prepare(self, state: PyTree, mass: PyTree) -> "Joints":
+    def prepare(self, state: PyTree, mass: PyTree) -> Self:
         """The joints as part of a scene; exact ones are closed at its start."""
-        if self.stiffness is None:
-            super().prepare(state, mass)
-        return self
+        return self if self.stiffness is not None else super().prepare(state, mass)
 
     def __call__(self, t: Time, state: PyTree, mass: PyTree) -> Wrench:
         """The wrench of springs; a TypeError for a state that is not of bodies in space."""

@@ -7,10 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import OptionalNumbers, as_positive_integer, as_real_quantity, quantity, unchecked_quantity
-from physjax.constraints.constraint import Constraint, check_joint_pairs, demand_closed, demand_order
+from physjax.constraints.constraint import (
+    Constraint,
+    check_joint_pairs,
+    check_limit,
+    demand_closed,
+    demand_order,
+    remember_breaks,
+)
 from physjax.constraints.coordinates import Places, PointCoordinates
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
@@ -28,6 +35,9 @@ class Rods(Constraint):
     order 2 under every method of order 2 or more; with `order=4` each is five of them, under a symmetric method such as verlet
     of order 4. What moves along a rod at the start is stopped by the first step. `constraint_forces` gives the tensions.
 
+    With `breaks_at` [N], one for all or one each, a rod that carries more at the end of a step is gone from then on, in
+    tension and in compression; a run records which are `unbroken`.
+
     Example:
         >>> bob = Particles(jnp.array([[1.0, 0.0]]), jnp.zeros((1, 2)))
         >>> pendulum = Scene(bob, forces=(forces.Gravity(), springs.Rods([(-1, 0)], anchors=[(0.0, 0.0)])))
@@ -43,6 +53,8 @@ class Rods(Constraint):
     )
     order: int = eqx.field(static=True, default=2)
     substeps: int = eqx.field(static=True, default=1)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -52,6 +64,7 @@ class Rods(Constraint):
         *,
         order: int = 2,
         substeps: int = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.anchors = None if anchors is None else as_real_quantity("anchors [m]", anchors)
         if self.anchors is not None and self.anchors.ndim != 2:
@@ -63,6 +76,7 @@ class Rods(Constraint):
         self.length = lengths
         self.order = demand_order("Rods", order)
         self.substeps = as_positive_integer("substeps", substeps)
+        self.breaks_at, self.unbroken = check_limit(breaks_at), None
 
     def __call__(self, t: Time, state: Particles, mass: Array) -> Float[Array, "*lanes dim"]:
         """No force of its own: the scene's motion is kept on the rods."""
@@ -112,6 +126,7 @@ class Rods(Constraint):
                 lambda rods: rods.length, self, self._measure_lengths(state), is_leaf=lambda leaf: leaf is None
             )
         )
+        rods = remember_breaks(rods, state)
         demand_closed(rods, state, lambda rod: f"rod {rod} between {self.pairs[rod]}")
         return rods
 

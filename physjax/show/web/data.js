@@ -43,8 +43,9 @@ function ticks(low, high, most) {
   return found.length > 1 ? found : ticks(low, high, 2 * most);
 }
 
-/** The colours of the strains, above what is drawn. */
+/** The colours of the strains, above what is drawn; rods have none. */
 function showStrainBar(part) {
+  if (part.limit === null) return;
   const bar = element("bar"), limit = +part.limit.toPrecision(2), colors = part.ramp.filter((_, i) => i % 15 === 0);
   bar.hidden = false;
   bar.innerHTML = `<i style="background:linear-gradient(90deg,${colors.map(c => `rgb(${c})`)})"></i><span><b>\u2212${limit}</b>strain [%]<b>+${limit}</b></span>`;

@@ -180,6 +180,9 @@ def _audit_step(
         change = _subtract(measure(now), measure(before))
         if stage.name == "resolve contacts" and stage.part is not None:
             budget = _enter(budget, contacts[stage.part], change)
+        elif stage.name == "close joints":
+            # impulses between bodies, due to what the contacts have done to them
+            budget = _enter(budget, contacts[-1], change)
         elif stage.name == "advance memory" and stage.part is not None:
             loses = _may_lose_energy(scene.forces[stage.part])
             budget = _enter(budget, f"{forces[stage.part]} parted" if loses else NUMERICAL, change)

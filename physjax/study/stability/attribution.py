@@ -11,6 +11,7 @@ from physjax.particles import Particles, callable_name
 from physjax.parts import Force
 from physjax.physics.springs.springs import Springs
 from physjax.scene import Scene
+from physjax.study.stability.joint_forces import JointForces
 from physjax.study.stability.linearisation import SmallMotion
 from physjax.study.stability.planar import strip_angles
 
@@ -34,13 +35,16 @@ def attribute_mode(
     weight = np.broadcast_to(np.sqrt(np.asarray(scene.mass))[..., None], state.position.shape)[block]
     moved = np.zeros(state.position.shape, complex)
     moved[block] = inner.reshape(shape) / weight
-    shares = [np.asarray(_measure_force_shares(force, scene, state, jnp.asarray(moved))) for force in scene.forces]
+    forces = [force for force in scene.forces if force.response is None]
+    joints = [JointForces.of(scene)] if scene.constraints else []
+    acting = [*forces, *joints]
+    shares = [np.asarray(_measure_force_shares(force, scene, state, jnp.asarray(moved))) for force in acting]
     stiffness, damping = np.sum(shares, axis=0)
     # λ² + damping λ + stiffness = 0, for a mode of length 1 as if it were an oscillator of its own
     root = np.sqrt(complex(damping**2 / 4 - stiffness))
     rate = -damping / 2 - root
     kind = int(abs(rate.real) >= abs(rate.imag))
-    force = scene.forces[int(np.argmax([abs(share[kind]) for share in shares]))]
+    force = acting[int(np.argmax([abs(share[kind]) for share in shares]))]
     size = np.sum(np.abs(moved) ** 2, axis=-1)
     node = tuple(int(i) for i in np.unravel_index(np.argmax(size), size.shape))
     load, seen = strip_angles(force, state)

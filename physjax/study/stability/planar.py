@@ -17,6 +17,7 @@ from physjax.particles import Particles, callable_name
 from physjax.parts import Force
 from physjax.physics.rigid.planar import PlanarBodies, PlanarInertia, Solids
 from physjax.scene import Scene
+from physjax.study.stability.joint_forces import JointForces, find_joint_rate
 from physjax.vectors import scale
 
 State = Particles | PlanarBodies
@@ -58,13 +59,26 @@ class PlanarForce(Force):
         return _join(force, torque / _find_gyration(inertia))
 
 
+class PlanarJoints(JointForces):
+    """The forces of all joints of a scene of bodies in the plane, on their three coordinates."""
+
+    def __call__(self, t: Time, state: Particles, mass: Array) -> Array:
+        """Force [N] and τ/k [N] on each body."""
+        scene = self.scene
+        rate = find_joint_rate(scene, t, _read_bodies(state, scene.mass))
+        return _join(rate.momentum, rate.angular_momentum / _find_gyration(scene.mass))
+
+
 def convert_scene(scene: Scene, state: PlanarBodies) -> tuple[Scene, Particles]:
     """A scene of bodies in the plane, without its contacts, and a state of it, as those of particles."""
     inertia = scene.mass
-    forces = []
+    forces: list[Force] = []
+    if scene.constraints:
+        forces.append(PlanarJoints.of(scene))
     for force in scene.forces:
-        numbers, structure = jax.tree.flatten((force, inertia))
-        forces.append(PlanarForce(numbers, structure, scene.couples))
+        if force.response is None:
+            numbers, structure = jax.tree.flatten((force, inertia))
+            forces.append(PlanarForce(numbers, structure, scene.couples))
     mass = jnp.broadcast_to(inertia.mass, scene.state.lanes)
     particles = _read_particles(state, inertia)
     return Scene(particles, mass, tuple(forces), pinned=scene.held), particles

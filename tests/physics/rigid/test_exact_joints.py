@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from physjax import Scene, constraint_forces, forces, inertia, methods, rigid, simulate, state_after
+from physjax import Scene, constraint_forces, forces, inertia, methods, rigid, simulate, stability, state_after
 
 G, ROD = 9.8, inertia.planar_segment(2.0, 1.0)
 BOX = inertia.box(1.0, (0.05, 0.4, 0.05))
@@ -84,6 +84,12 @@ def test_held_bodies_hold_what_is_joined_to_them():
     film = simulate(scene, methods.verlet, dt=0.01, steps=50)
     assert (film.position[:, :1] == x[None, :1]).all()
     assert jax.vmap(joints.error)(film.state).max() < 1e-11
+
+
+def test_the_limit_of_a_hung_rod_is_set_by_its_swing():
+    limit = stability.limit(hang_rods(angle=0.0), methods.verlet)
+    assert limit.dt == pytest.approx(2 / np.sqrt(G * 0.5 / (1 / 3)), rel=1e-6)
+    assert (limit.cause, limit.force) == ("stiffness", "Joints")
 
 
 @pytest.mark.parametrize(

@@ -267,5 +267,8 @@ def test_the_ledger_books_no_work_to_rods_and_their_push_on_the_anchor():
 
 
 def test_rods_add_no_stiffness_the_limit_is_that_of_the_swing():
-    at_rest = pendulum([0.0, 0.0])
-    assert stability.limit(at_rest, methods.verlet).dt == pytest.approx(2 / np.sqrt(G * (2 + np.sqrt(2))), rel=1e-6)
+    fastest = np.sqrt(G * (2 + np.sqrt(2)))
+    limit = stability.limit(pendulum([0.0, 0.0]), methods.verlet)
+    assert limit.dt == pytest.approx(2 / fastest, rel=1e-6)
+    assert (limit.cause, limit.force) == ("stiffness", "Rods")
+    assert limit.rate == pytest.approx(-1j * fastest, rel=1e-6)
