@@ -58,13 +58,13 @@ LARGEST_BURST_CORRECTION = 1e6
 class Emitter(ParticleSource):
     """A pool of particles born from a source: `Scene(emitter.unborn(), ..., emitter=emitter)`.
 
-    From the time `start` [s] on, particles are born one by one at a `rate` [1/s], or in bursts of `burst` particles (by
-    default the whole pool) at intervals of `every` [s]; with neither, once. A particle leaves the source with a `speed`
-    [m/s] in a direction within the half-angle `cone` [rad] about `direction` (by default the outward normal of the source)
-    and lives for `life` [s]. Speed, life and size [m] of each particle are uniform within mean·(1 ± spread). `key` is a
-    seed or a `jax.random.key`. A source that moves has a `path(t) -> displacement` [m], `(dim,)`: particles are born along
-    it, each at its own time, with the velocity of the path added to theirs. With `opposed`, bursts are of pairs with opposite velocities, so that their momentum is
-    zero.
+    From the time `start` [s] on, particles are born one by one at a `rate` [1/s], or in bursts of `burst` particles
+    (by default the whole pool) at intervals of `every` [s]; with neither, once. A particle leaves the source with a
+    `speed` [m/s] in a direction within the half-angle `cone` [rad] about `direction` (by default the outward normal
+    of the source) and lives for `life` [s]. Speed, life and size [m] of each particle are uniform within mean·(1 ±
+    spread). `key` is a seed or a `jax.random.key`. A source that moves has a `path(t) -> displacement` [m], `(dim,)`:
+    particles are born along it, each at its own time, with the velocity of the path added to theirs. With `opposed`,
+    bursts are of pairs with opposite velocities, so that their momentum is zero.
 
     All numbers but counts can be swept and differentiated (at fixed generations). Raises ValueError where a slot is needed
     before its particle has died, with the pool that is needed; with `drop_oldest` the oldest particle is replaced instead.
