@@ -121,6 +121,30 @@ class Magnus(Force):
         return scale(0.5 * self.density * self.coefficient * self.area * norm(v), spin(axis, v))
 
 
+class Lorentz(Force):
+    """The force of electric and magnetic fields on a charge: F = q (E + v×B).
+
+    Charge q [C]. The magnetic field B [T] is a vector in space; in the plane it is a number, its component towards the
+    viewer. The electric field E [V/m] is a vector, by default none. Fields that depend on the place are a force of your
+    own. `methods.boris` keeps the speed in a magnetic field to rounding; others lose or gain it.
+
+    Example:
+        >>> print(forces.Lorentz(charge=2.0, magnetic=1.5, electric=(1.0, 0.0))(0.0, ball, shot.mass))
+        [14. -9.]
+    """
+
+    charge: Numbers = quantity("charge q", "C")
+    magnetic: Numbers = quantity("magnetic field B", "T", kind="axial")
+    electric: OptionalNumbers = quantity("electric field E", "V/m", kind="vector", default=None)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """q (E + v×B) [N]."""
+        field = -spin(self.magnetic, state.velocity)
+        if self.electric is not None:
+            field = field + broadcast_vector(self.electric, state.velocity)
+        return scale(self.charge, field)
+
+
 class RotatingFrame(Field):
     """The inertial forces of a rotating frame: centrifugal -mω×(ω×r), Coriolis -2mω×v and, where ω changes, Euler's -mω̇×r.
 
@@ -221,7 +245,7 @@ def _broadcast_omega(omega: Array, r: Array) -> Array:
     return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else broadcast_vector(omega, r)
 
 
-__all__ = ["Anchor", "Magnus", "QuadraticDrag", "RotatingFrame", "SphereDrag", "StokesDrag", "independent"]
+__all__ = ["Anchor", "Lorentz", "Magnus", "QuadraticDrag", "RotatingFrame", "SphereDrag", "StokesDrag", "independent"]
 
 
 def __dir__() -> list[str]:

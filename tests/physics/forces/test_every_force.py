@@ -45,6 +45,8 @@ CASES = {
     "Magnus in the plane": Case(forces.Magnus, {"area": 0.1, "coefficient": 0.4, "axis": -2.0}, {}, 2),
     "Buoyancy": Case(forces.Buoyancy, {"density": 1e3, "volume": 1e-3, "g": 9.8}, {}, 2),
     "Buoyancy at a surface": Case(forces.Buoyancy, {"density": 1e3, "radius": 0.8, "surface": 0.1, "g": 9.8}, {}, 2),
+    "Lorentz": Case(forces.Lorentz, {"charge": 0.3}, {"magnetic": [1.0, 2.0, -3.0], "electric": [0.2, 0.0, 0.5]}, 3),
+    "Lorentz in the plane": Case(forces.Lorentz, {"charge": 0.3, "magnetic": -2.0}, {}, 2),
     "RotatingFrame": Case(forces.RotatingFrame, {}, {"omega": [0.4, 1.0, -0.3]}, 3),
     "RotatingFrame, changing": Case(
         forces.RotatingFrame, {}, {"omega": [0.4, 1.0, -0.3], "omega_rate": [0.2, 0.0, 0.5]}, 3
