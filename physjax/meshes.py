@@ -202,3 +202,6 @@ def _demand_whole_stl(file: Path) -> None:
             f"{file.name}: is not an STL file, or truncated: as a binary one it has {len(content)} bytes and says {stated} "
             f"triangles, as text it has {facets} facets with {corners} vertices."
         )
+
+
+__all__ = ["WeldedMesh", "check_mesh", "find_near_pieces", "read_mesh", "weld"]

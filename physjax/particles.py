@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.checks import Vectors, as_real_array, as_real_quantity
+from physjax.checks import Vectors, as_real_array, as_real_quantity, concrete_or_none, demand_all
 from physjax.loops import Time, time_for_part, to_float_time
 from physjax.vectors import dot, scale
 
@@ -81,6 +81,13 @@ class StateRecord(Protocol):
     def hold_lanes(self, free: Array) -> PyTree:
         """The state with held lanes (free = 0) at rest."""
         ...
+
+
+MASS_ADVICE = (
+    "numbers > 0: hold what nothing shall move with Scene(pinned=mask); test particles that attract nothing have a mass, and "
+    "gm=0 in forces.Gravitation(gm=...)"
+)
+"""What a mass of zero is meant to say, and how to say it."""
 
 
 class Particles(NamedTuple):
@@ -207,7 +214,9 @@ class Particles(NamedTuple):
         for name, array in (("position [m]", x), ("velocity [m/s]", v)):
             as_real_quantity(name, array)
         state = Particles(x.astype(x.dtype), v.astype(v.dtype))  # astype makes weakly typed arrays strong
-        mass = as_real_quantity("mass [kg]", mass, above=0.0).astype(state.dtype)
+        mass = as_real_quantity("mass [kg]", mass).astype(state.dtype)
+        if (values := concrete_or_none(mass)) is not None:
+            demand_all("mass [kg]", mass, values > 0, MASS_ADVICE)
         if mass.shape not in ((), state.lanes):
             raise ValueError(f"mass [kg]: got shape {mass.shape}, expected () or the lanes' shape {state.lanes}.")
         return state, mass

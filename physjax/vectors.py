@@ -169,6 +169,10 @@ def axis_vector(amount: Float[Array, "..."], up: int, like: Float[Array, "*lanes
     return scale(amount, jnp.broadcast_to(axis, like.shape))
 
 
+upward = axis_vector
+"""The name of the first edition."""
+
+
 # quaternions (w, x, y, z), as lists of components: XLA on CPU recomputes a vector for each use of a component
 
 

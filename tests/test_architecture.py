@@ -104,7 +104,7 @@ def test_every_way_to_import_is_seen(file, line, found):
     assert list(imports(ast.parse(line), file)) == [found]
 
 
-ALIASES = {"physics/fields.py", "physics/inertia.py", "physics/lattices.py", "scenes/gallery.py"}
+ALIASES = {"physics/fields.py", "physics/inertia.py", "physics/lattices.py", "physics/meshes.py", "scenes/gallery.py"}
 """Old names of modules that users import."""
 
 

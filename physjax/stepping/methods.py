@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 
 from physjax.loops import Time
 from physjax.stepping.adaptive import adaptive, count_steps
+from physjax.stepping.boris import take_boris_step
 from physjax.stepping.compositions import BLANES_MOAN_4, KAHAN_LI_8, compose_leapfrogs, take_split_step
 from physjax.stepping.implicit import ImplicitEuler, ImplicitMidpoint, TrBdf2
 from physjax.stepping.nystrom import DPRKN6, NystromPair, take_nystrom_step
@@ -194,6 +195,24 @@ def dprkn6(system: System, t: Time, state: S, dt: ArrayLike) -> S:
     return take_nystrom_step(DPRKN6, system, t, state, dt)
 
 
+@promises(order=2, evaluations=1, stability_limit=2.0, special=True)
+def boris(system: System, t: Time, state: S, dt: ArrayLike) -> S:
+    """Boris' method, for charges in magnetic fields: leapfrog whose kick sees the mean of the old and the new velocity.
+
+    Of a force that is linear in the velocity, and of position otherwise, this is solved exactly, lane by lane: in a magnetic
+    field alone |v| is kept to rounding at any step, which no other explicit method does. Other forces are linearised
+    there. Second order with forces of any kind, but first with dampers between lanes, which see the old velocity in part.
+
+    Example:
+        >>> field = (forces.Lorentz(charge=1.0, magnetic=1.0),)
+        >>> circle = Scene(Particles(jnp.zeros(2), jnp.array([3.0, 4.0])), forces=field)
+        >>> end = methods.boris(circle, 0.0, circle.state, 1.5)
+        >>> round(float(jnp.hypot(*end.velocity)), 5)
+        5.0
+    """
+    return take_boris_step(system, t, state, dt)
+
+
 implicit_euler = ImplicitEuler()
 """Implicit Euler, linearised once a step: stable at any step, damps; `ImplicitEuler(newton=20)` converges the full step."""
 implicit_midpoint = ImplicitMidpoint()
@@ -211,6 +230,7 @@ __all__ = [
     "TrBdf2",
     "adaptive",
     "blanes_moan4",
+    "boris",
     "count_steps",
     "dopri8",
     "dprkn6",

@@ -8,7 +8,8 @@ from physjax.stepping.pairs import Pair
 METHODS: dict[str, Callable] = {}
 """Every method for scenes of any kind by name, in the order of their definition."""
 SPECIAL_METHODS: dict[str, Callable] = {}
-"""Every method that is made for forces of place and time alone: with others it is of order 1, or refuses them."""
+"""Every method that is made for forces of one kind: of place and time alone (with others it is of order 1, or refuses them),
+or magnetic ones (with forces of place alone it is leapfrog at a higher price)."""
 
 
 def find_method(name: str) -> Callable:

@@ -101,6 +101,11 @@ def has_no_lanes(state: PyTree) -> bool:
     return isinstance(state, _LaneRecord) and state.lanes == ()
 
 
+def count_lane_axes(state: PyTree) -> int:
+    """How many axes of lanes the arrays of a state have in front: none where it does not say."""
+    return len(state.lanes) if isinstance(state, _LaneRecord) else 0
+
+
 def leaf_dtype(state: PyTree) -> jax.numpy.dtype:
     """The floating-point type of a state."""
     return jax.tree.leaves(state)[0].dtype

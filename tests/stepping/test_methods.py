@@ -42,6 +42,7 @@ def thrown(method, dt, steps, dtype=float):
         ("dopri8", 0),
         ("blanes_moan4", 0),
         ("kahan_li8", 0),
+        ("boris", 0),
     ],
 )
 def test_constant_acceleration_is_exact_or_off_by_exactly_half_a_step(name, share, precision):

@@ -17,7 +17,7 @@ from physjax.backend import any_lane
 from physjax.loops import Time, bounded_while_loop, to_float_time
 from physjax.particles import Particles
 from physjax.physics.contacts.resting import Reaction
-from physjax.physics.contacts.surfaces import Surfaces, Touch, mask_surfaces, relative_to
+from physjax.physics.contacts.surfaces import Surfaces, Touch, average_surfaces, mask_surfaces, relative_to
 from physjax.scene import Scene
 from physjax.vectors import dot, norm, scale, unit
 
@@ -69,7 +69,7 @@ def decide_contact_mode(
     load_speed_squared = load_squared * (dt * dt)
     touching = jnp.isfinite(since) & _is_close(touch, state, load_speed_squared, dt)
     contacts = _build_contact_states(surfaces, touch, time, state, touching, load_speed_squared)
-    left, normal_force = _solve_contact_forces(contacts, load)
+    left, normal_force = _solve_contact_forces(contacts, _subtract_carried(surfaces, contacts, load, time, state))
     away = dot(jnp.broadcast_to(left, touch.normal.shape), touch.normal) + contacts.curvature_acceleration
     pressed = touching & ~((normal_force <= 0) & (away > 0))
     # sticking takes both: no slip yet, on any surface, and a load that static friction balances
@@ -177,6 +177,18 @@ def _build_contact_states(
         still,
         _find_sticking_limit(surfaces, state.lanes),
     )
+
+
+def _subtract_carried(
+    surfaces: Surfaces, contacts: _ContactStates, load: Array, t: ArrayLike, state: Particles
+) -> Array:
+    """The load less what a lane needs along the surface to turn with it; across it, the curvature asks for that already."""
+    carried = surfaces.acceleration_at(t, state.position)
+    if carried is None:
+        return load
+    along = carried - scale(dot(carried, contacts.normal), contacts.normal)
+    turns = mask_surfaces(surfaces.turns, contacts.touching).astype(load.dtype)
+    return load - average_surfaces(contacts.touching * turns, along)
 
 
 def _find_sticking_limit(surfaces: Surfaces, lanes: tuple[int, ...]) -> Array | None:

@@ -64,7 +64,7 @@ def find_next_event(
     dip = map_stacks(lambda face: find_dip(face, t, dt, start, end), faces.stacks)
     # the reaction keeps a lane that presses on a surface on it: rounding there is no impact
     dip = dip._replace(last=jnp.where(pressed, jnp.inf, dip.last))
-    before, after = reaction.measure_slides(start), reaction.measure_slides(end)
+    before, after = reaction.measure_slides(t, start), reaction.measure_slides(t + dt, end)
     if before is not None and after is not None:
         stop = _find_stop(before, after)
         dip = Dip(*(jnp.concatenate([a, b]) for a, b in zip(dip, stop, strict=True)))

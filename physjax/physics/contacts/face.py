@@ -48,10 +48,19 @@ class ContactFace(Face, Material, Protocol):
 
     curved: bool
     velocity: OptionalNumbers
+    angular_velocity: OptionalNumbers
     touching_since: OptionalNumbers
 
     def facing(self, t: ArrayLike, position: Array) -> "ContactFace":
         """The surface as a lane at this position meets it."""
+        ...
+
+    def velocity_at(self, t: ArrayLike, position: Array) -> Array | None:
+        """The velocity of the surface itself at positions on it [m/s]; None where it does not move."""
+        ...
+
+    def acceleration_at(self, t: ArrayLike, position: Array) -> Array | None:
+        """The acceleration of what sticks to the surface there [m/s²]; None where it does not turn."""
         ...
 
     def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:

@@ -65,7 +65,7 @@ def measure_guards(faces: Surfaces, reaction: Reaction, t: ArrayLike, state: Par
     The faces are those of the beginning of the leg: a moving slab may since have passed the place where a lane was, and
     would then show it the other face.
     """
-    distance, slide = faces.signed_distance(t, state.position), reaction.measure_slides(state)
+    distance, slide = faces.signed_distance(t, state.position), reaction.measure_slides(t, state)
     return distance if slide is None else jnp.concatenate([distance, slide])
 
 
@@ -83,11 +83,11 @@ def meet_surface(
     numbers = jnp.arange(len(guards), dtype=guard.dtype).reshape(-1, *(1,) * guard.ndim)
     chosen = guard[None] == numbers[:count]
     pick = lambda values: None if values is None else select_surface(chosen, values)  # noqa: E731
-    touch = Touch(guards[:count], faces.normal_at(t, at.position), faces.velocity_at(at.velocity))
+    touch = Touch(guards[:count], faces.normal_at(t, at.position), faces.velocity_at(t, at.position))
     carried, static, kinetic = map(pick, (touch.carried, faces.static_friction(lanes), faces.kinetic_friction(lanes)))
     slip = None
     if reaction.slip is not None:
-        belt = reaction.carry(at)
+        belt = reaction.carry(t, at)
         slip = at.velocity if belt is None else at.velocity - select_surface(guard[None] == numbers[count:], belt)
     return Meeting(
         touch,

@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.particles import Particles
-from physjax.physics.contacts.surfaces import Surfaces, relative_to
+from physjax.physics.contacts.surfaces import Surfaces, average_surfaces, mask_surfaces, relative_to
 from physjax.vectors import dot, norm, scale, turn_left
 
 NEGLIGIBLE_SPEED = 1e-15
@@ -28,8 +28,8 @@ class Reaction(eqx.Module):
     place, its second and so on (None: every surface has a place of its own), `pressed` which places are taken (1 or 0),
     and `slip` the direction in which the lane slips there at the start of the leg. Friction keeps that direction through
     the leg, beyond the moment at which a slide stops: the path stays smooth, and the stop is found as a root on it.
-    Lanes that stick (`still`) do not accelerate at all. Without `any_contact` the reactions are always computed: for a
-    single surface and few lanes that is less work than to ask.
+    Lanes that stick (`still`) do not accelerate, but with a surface that turns. Without `any_contact` the reactions are
+    always computed: for a single surface and few lanes that is less work than to ask.
     """
 
     surfaces: Surfaces
@@ -48,7 +48,7 @@ class Reaction(eqx.Module):
     def _add_reactions(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:
         normal = self._take_places(self.surfaces.normal_at(t, state.position))
         turn = self.surfaces.curvature_acceleration(t, state)
-        along = normal if self.slip is None else self._lean(normal, state, self.slip)
+        along = normal if self.slip is None else self._lean(t, normal, state, self.slip)
         # N_j along each reaction so that no lane accelerates into a surface that it presses on: n·a + v·∇n·v = 0
         wanted = -dot(jnp.broadcast_to(acceleration, normal.shape), normal)
         if turn is not None:
@@ -58,7 +58,13 @@ class Reaction(eqx.Module):
             scale(force[0], along[0]) if len(force) == 1 else jnp.sum(scale(force, along), 0)
         )
         # a product and not a choice: `where` between vectors costs several times the step
-        return scale(1 - self.still, acceleration)
+        acceleration = scale(1 - self.still, acceleration)
+        carried = self.surfaces.acceleration_at(t, state.position)
+        if carried is None:
+            return acceleration
+        turns = jnp.broadcast_to(mask_surfaces(self.surfaces.turns, carried[..., 0]), carried.shape[:-1])
+        pressed = self.pressed * self._take_places(turns.astype(acceleration.dtype))
+        return acceleration + scale(self.still, average_surfaces(pressed, self._take_places(carried)))
 
     def _take_places(self, values: Array) -> Array:
         """Of each place the value of the surface that takes it: a sum, of which all shares but one are zero."""
@@ -67,23 +73,23 @@ class Reaction(eqx.Module):
         mask = self.places if self.places.ndim == values.ndim + 1 else self.places[..., None]
         return jnp.sum(jnp.where(mask, values[None], 0.0), axis=1)
 
-    def _lean(self, normal: Array, state: Particles, slip: Array) -> Array:
+    def _lean(self, t: ArrayLike, normal: Array, state: Particles, slip: Array) -> Array:
         """The direction of normal force and friction together: the normal, and μ_k against the slip."""
         kinetic = self.surfaces.kinetic_friction(state.lanes)
         assert kinetic is not None, "a slip is only decided where a surface is rough"
-        relative = relative_to(self.carry(state), state.velocity, len(slip))
+        relative = relative_to(self.carry(t, state), state.velocity, len(slip))
         across, length = _find_slip_direction(slip, normal, relative)
         return normal - scale(self._take_places(kinetic) / length, across)
 
-    def measure_slides(self, state: Particles) -> Array | None:
+    def measure_slides(self, t: ArrayLike, state: Particles) -> Array | None:
         """The speed of each slide in the direction in which it began [m/s], zero where it stops; None without friction."""
         if self.slip is None:
             return None
-        return dot(relative_to(self.carry(state), state.velocity, len(self.slip)), self.slip)
+        return dot(relative_to(self.carry(t, state), state.velocity, len(self.slip)), self.slip)
 
-    def carry(self, state: Particles) -> Array | None:
+    def carry(self, t: ArrayLike, state: Particles) -> Array | None:
         """The velocities of the surfaces that take the places [m/s]; None where no surface moves."""
-        carried = self.surfaces.velocity_at(state.velocity)
+        carried = self.surfaces.velocity_at(t, state.position)
         return None if carried is None else self._take_places(carried)
 
 

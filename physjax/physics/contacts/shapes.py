@@ -2,7 +2,8 @@
 
 `signed_distance` [m] is positive on the legal side, zero on the surface and negative on the wrong side; `normal_at`
 points to the legal side. Shapes may move with a constant `velocity` [m/s] from where they are at t = 0 (a piston, a
-bat). The contact response is the same for all of them and stands in `surface`.
+bat), and turn within themselves with an `angular_velocity` [rad/s] (a turntable, a drum). The contact response is the
+same for all of them and stands in `surface`.
 """
 
 from dataclasses import replace
@@ -19,7 +20,7 @@ from physjax.cubics import Cubic
 from physjax.particles import Particles, sum_terms
 from physjax.physics.contacts.face import LowestPoint
 from physjax.physics.contacts.surface import Surface
-from physjax.vectors import broadcast_vector, dot, norm, scale, unit
+from physjax.vectors import broadcast_vector, cross, dot, norm, scale, unit
 
 __all__ = ["Plane", "Room", "Slab", "Sphere"]
 
@@ -29,6 +30,8 @@ R = TypeVar("R", bound="Room")
 
 SMALLEST_LENGTH_SQUARED = 1e-30
 """Length² [m²] of a segment below which it is a point: it stands in for a zero that would be divided by."""
+AXIS_ROUNDING = 64
+"""Units of rounding by which the axis of a flat surface that turns may be off its normal [rad]."""
 VELOCITY_ROUNDING = 4
 """Units of rounding below which a plane's velocity along its own normal is the zero that it is meant to be."""
 
@@ -40,6 +43,9 @@ class Plane(Surface):
         >>> slope = contacts.Plane(point=(0.0, 5.0), normal=(3.0, 4.0))
         >>> round(float(slope.signed_distance(0.0, ball.position)), 3)
         4.0
+        >>> turntable = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), angular_velocity=(0.0, 2.0, 0.0))
+        >>> print(turntable.velocity_at(0.0, jnp.array([0.5, 0.0, 0.0])))
+        [ 0.  0. -1.]
     """
 
     curved: ClassVar[bool] = False
@@ -49,10 +55,15 @@ class Plane(Surface):
 
     def __check_init__(self):
         demand_direction("normal of the plane", self.normal)
+        _demand_axis_along_normal(self)
 
     def relations(self) -> tuple[Array, ...]:
         """Conditions on its numbers, checked also where they are traced."""
-        return (dot(self.normal, self.normal) > 0,)
+        return (dot(self.normal, self.normal) > 0, *_relate_axis(self))
+
+    def axis_point(self, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """The point of the plane."""
+        return broadcast_vector(self.point, position)
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """(X - P)·N [m]."""
@@ -86,10 +97,15 @@ class Slab(Surface):
 
     def __check_init__(self):
         demand_direction("normal of the slab", self.normal)
+        _demand_axis_along_normal(self)
 
     def relations(self) -> tuple[Array, ...]:
         """Conditions on its numbers, checked also where they are traced."""
-        return (dot(self.normal, self.normal) > 0,)
+        return (dot(self.normal, self.normal) > 0, *_relate_axis(self))
+
+    def axis_point(self, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """The point in its middle."""
+        return broadcast_vector(self.point, position)
 
     def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Distance to the nearer face [m]."""
@@ -113,6 +129,7 @@ class Slab(Surface):
             friction=self.friction,
             coulomb=self.coulomb,
             velocity=self.velocity,
+            angular_velocity=self.angular_velocity,
             scaled=True,
         )
 
@@ -132,6 +149,36 @@ def _unit_normal(surface: Plane | Slab) -> Array:
 
 def _scale_normal(surface: F) -> F:
     return replace(surface, normal=_unit_normal(surface), scaled=True)
+
+
+def _relate_axis(surface: Plane | Slab) -> tuple[Array, ...]:
+    """Whether a flat surface that turns does so about its own normal: else it would tilt."""
+    omega = surface.angular_velocity
+    if omega is None:
+        return ()
+    omega, normal = jnp.broadcast_arrays(omega, _unit_normal(surface))
+    across = cross(omega, normal)
+    rounding = AXIS_ROUNDING * float(jnp.finfo(omega.dtype).eps)
+    return (dot(across, across) <= rounding**2 * dot(omega, omega),)
+
+
+def _demand_axis_along_normal(surface: Plane | Slab) -> None:
+    """Raise a ValueError for a flat surface that turns about another axis than its normal."""
+    omega, name = surface.angular_velocity, type(surface).__name__
+    if omega is None:
+        return
+    if surface.normal.shape[-1] != 3 or omega.shape[-1:] != (3,):
+        raise ValueError(
+            f"{name}: got angular_velocity of shape {omega.shape} and a normal of {surface.normal.shape[-1]} components, "
+            "expected vectors in space: a line in the plane cannot turn within itself. A drum in the plane is a "
+            "contacts.Sphere(inside=True)."
+        )
+    (along,) = map(concrete_or_none, _relate_axis(surface))
+    if along is not None and not along.all():
+        raise ValueError(
+            f"{name}: got angular_velocity {omega} across the normal {surface.normal}, expected a multiple of it: a flat "
+            "surface turns within itself, as a turntable does. What tilts is a shape of your own."
+        )
 
 
 def _measure_height(surface: Plane | Slab, t: ArrayLike, position: Array, normal: Array) -> Array:
@@ -181,6 +228,10 @@ class Sphere(Surface):
         along = dot(relative, offset) * inverse
         across = (dot(relative, relative) - along * along) * inverse
         return -across if self.inside else across
+
+    def axis_point(self, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """The center."""
+        return broadcast_vector(self.center, position)
 
     @property
     def narrow(self) -> bool:
@@ -247,6 +298,10 @@ class Room(Surface):
         if lower is not None and upper is not None:
             demand_all(
                 "upper corner [m]", self.upper, upper > lower, f"above the lower corner {lower} in every component"
+            )
+        if self.angular_velocity is not None:
+            raise ValueError(
+                "Room: got angular_velocity=, expected none: walls that turn would sweep through the corners."
             )
 
     def relations(self) -> tuple[Array, ...]:

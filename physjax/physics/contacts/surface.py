@@ -21,7 +21,7 @@ from physjax.physics.contacts.path_search import bound_path_length, find_path_di
 from physjax.physics.contacts.restitution import Coulomb, apply_restitution
 from physjax.physics.contacts.time_of_impact import impact
 from physjax.scene import Scene, project
-from physjax.vectors import broadcast_vector, dot, norm, scale, unit
+from physjax.vectors import broadcast_vector, dot, norm, scale, spin, unit
 
 S = TypeVar("S", bound="Surface")
 
@@ -40,6 +40,11 @@ class Surface(Contact):
     (K_r = 0 sticks only with K_f = 1 as well, and gravity acts again in the next step: the lecture's "stick to wall"
     lasts for a moment.)
 
+    What turns within itself has an `angular_velocity` Ω [rad/s], a vector in space and a number in the plane (> 0:
+    anticlockwise): friction then sees velocity + Ω×r, with r from the axis. The axis goes through the point of a plane or
+    slab, along its normal (a turntable), and through the center of a sphere (a drum, a ball that spins); that of a shape
+    of your own, which must be round about it, goes through `axis_point`.
+
     A shape of your own is a subclass with a `signed_distance(t, position)` and nothing else: its normal and curvature
     follow by differentiation. Override `normal_at` and `curvature_acceleration` where closed forms are known. The
     distance must be right to first order at the surface, where its gradient has length 1, and must nowhere be greater
@@ -57,6 +62,9 @@ class Surface(Contact):
     friction: OptionalNumbers = quantity("friction K_f", "1", at_least=0, at_most=1, default=None, kw_only=True)
     coulomb: Coulomb | None = eqx.field(default=None, kw_only=True)
     velocity: OptionalNumbers = quantity("surface velocity", "m/s", kind="vector", default=None, kw_only=True)
+    angular_velocity: OptionalNumbers = quantity(
+        "angular velocity of the surface", "rad/s", kind="axial", default=None, kw_only=True
+    )
     # a field or a property where other contacts have a class attribute: all are read the same way
     response: Callable[..., Scene] | None = eqx.field(  # pyright: ignore[reportIncompatibleVariableOverride]
         static=True, default=None, kw_only=True
@@ -97,8 +105,35 @@ class Surface(Contact):
         return unit(jax.grad(lambda x: jnp.sum(self.signed_distance(t, x)))(position))
 
     def relative(self, velocity: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-        """Velocities relative to the surface [m/s]."""
+        """Velocities relative to the surface as a whole, without its turning, which does not change the distance [m/s]."""
         return velocity if self.velocity is None else velocity - broadcast_vector(self.velocity, velocity)
+
+    def axis_point(self, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """A point on the axis about which the surface turns [m], at t = 0, one for each of these positions: the origin."""
+        return jnp.zeros_like(position)
+
+    def velocity_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
+        """The velocity of the surface itself at positions on it, v + Ω×r [m/s]; None where it does not move."""
+        turning = None if self.angular_velocity is None else spin(self.angular_velocity, self._arm(t, position))
+        if self.velocity is None:
+            return turning
+        velocity = broadcast_vector(self.velocity, position)
+        return velocity if turning is None else velocity + turning
+
+    def acceleration_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
+        """The acceleration of what sticks to the surface there, Ω×(Ω×r) [m/s²]; None where it does not turn."""
+        if self.angular_velocity is None:
+            return None
+        return spin(self.angular_velocity, spin(self.angular_velocity, self._arm(t, position)))
+
+    def velocity_rate(self, velocity: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
+        """How fast `velocity_at` changes at a place that moves with a velocity, Ω×ẋ [m/s²]; None where it does not turn."""
+        return None if self.angular_velocity is None else spin(self.angular_velocity, self.relative(velocity))
+
+    def slip(self, t: ArrayLike, state: Particles) -> Float[Array, "*lanes dim"]:
+        """Velocities relative to the surface where each lane is, turning included [m/s]: what friction sees."""
+        carried = self.velocity_at(t, state.position)
+        return state.velocity if carried is None else state.velocity - carried
 
     def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """What the curvature adds to the second time derivative of the signed distance: v·∇n·v [m/s²], zero if flat."""
@@ -133,7 +168,7 @@ class Surface(Contact):
         signed_distance, normal, relative = (
             self.signed_distance(t, state.position),
             self.normal_at(t, state.position),
-            self.relative(state.velocity),
+            self.slip(t, state),
         )
         inward = jnp.where(signed_distance < 0, jnp.minimum(dot(relative, normal), 0.0), 0.0)
         return apply_restitution(self, state, (jnp.minimum(signed_distance, 0.0), normal, relative), inward)
@@ -152,7 +187,7 @@ class Surface(Contact):
         self, touching: Array, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
     ) -> Bool[Array, "*lanes"]:
         """Whether a lane may meet the surface within a step, or, where it slides already (`touching`), may stop."""
-        before, after = self.relative(start.velocity), self.relative(end.velocity)
+        before, after = self.slip(t, start), self.slip(t + dt, end)
         meets = self.facing(t, start.position).may_dip(t, dt, start, end)
         if self.coulomb is None:
             return meets & ~touching
@@ -205,6 +240,10 @@ class Surface(Contact):
             return self
         since = [wall.touching_since for wall in self.walls()]
         return self.remember_since([jnp.where(lanes, jnp.inf, start) for start in since if start is not None])
+
+    def _arm(self, t: ArrayLike, position: Array) -> Array:
+        """From the axis to positions [m]."""
+        return self._to_rest_frame(t, position) - self.axis_point(position)
 
     def _to_rest_frame(self, t: ArrayLike, position: Array) -> Array:
         """Positions in the frame in which the surface stands where it is at t = 0."""

@@ -16,7 +16,7 @@ from jaxtyping import Array
 from physjax.particles import Particles
 from physjax.physics.contacts.face import ContactFace
 from physjax.stacks import Stack, map_stacks, stack_alike, unstack
-from physjax.vectors import broadcast_vector
+from physjax.vectors import scale
 
 
 class Touch(NamedTuple):
@@ -47,8 +47,13 @@ class Surfaces(eqx.Module):
 
     @property
     def moves(self) -> np.ndarray:
-        """Which of them have a velocity."""
-        return self._mark(lambda part: part.velocity is not None)
+        """Which of them move, or turn within themselves."""
+        return self._mark(lambda part: part.velocity is not None or part.angular_velocity is not None)
+
+    @property
+    def turns(self) -> np.ndarray:
+        """Which of them turn."""
+        return self._mark(lambda part: part.angular_velocity is not None)
 
     @property
     def rough(self) -> np.ndarray:
@@ -78,17 +83,22 @@ class Surfaces(eqx.Module):
         """Unit vectors towards the legal side."""
         return map_stacks(lambda part: part.normal_at(t, position), self.stacks)
 
-    def velocity_at(self, like: Array) -> Array | None:
-        """The velocities of the surfaces [m/s]; None where none moves."""
+    def velocity_at(self, t: ArrayLike, position: Array) -> Array | None:
+        """The velocities of the surfaces where lanes are [m/s]; None where none moves."""
         if not self.moves.any():
             return None
-        own = lambda part: jnp.zeros_like(like) if part.velocity is None else broadcast_vector(part.velocity, like)  # noqa: E731
-        return map_stacks(own, self.stacks)
+        return map_stacks(lambda part: _or_zero(part.velocity_at(t, position), position), self.stacks)
+
+    def acceleration_at(self, t: ArrayLike, position: Array) -> Array | None:
+        """The accelerations of what sticks to them [m/s²]; None where none turns."""
+        if not self.turns.any():
+            return None
+        return map_stacks(lambda part: _or_zero(part.acceleration_at(t, position), position), self.stacks)
 
     def measure(self, t: ArrayLike, state: Particles) -> Touch:
         """Where the state is relative to every surface."""
-        x, v = state
-        return Touch(self.signed_distance(t, x), self.normal_at(t, x), self.velocity_at(v))
+        x = state.position
+        return Touch(self.signed_distance(t, x), self.normal_at(t, x), self.velocity_at(t, x))
 
     def curvature_acceleration(self, t: ArrayLike, state: Particles) -> Array | None:
         """What the curvature adds to the second time derivative of the signed distances [m/s²]; None if all are flat."""
@@ -137,6 +147,10 @@ class Surfaces(eqx.Module):
         return np.concatenate([np.full(stack.size, says(stack.part)) for stack in self.stacks])
 
 
+def _or_zero(vectors: Array | None, like: Array) -> Array:
+    return jnp.zeros_like(like) if vectors is None else vectors
+
+
 def mask_surfaces(marks: np.ndarray, like: Array) -> Array:
     """Marks of the surfaces shaped to broadcast with `(surfaces, *lanes)` arrays."""
     return jnp.asarray(marks.reshape(-1, *(1,) * (like.ndim - 1)))
@@ -145,6 +159,12 @@ def mask_surfaces(marks: np.ndarray, like: Array) -> Array:
 def relative_to(carried: Array | None, velocity: Array, count: int) -> Array:
     """Velocities relative to every surface [m/s], of which the velocities are given."""
     return jnp.broadcast_to(velocity, (count, *velocity.shape)) if carried is None else velocity[None] - carried
+
+
+def average_surfaces(weight: Array, vectors: Array) -> Array:
+    """The mean over the surfaces of a vector of each, where their weights are 1; zero where all are 0."""
+    share = weight / jnp.maximum(jnp.sum(weight, axis=0, keepdims=True), 1)
+    return jnp.sum(scale(share, vectors), axis=0)
 
 
 def select_surface(chosen: Array, values: Array) -> Array:

@@ -42,7 +42,7 @@ from physjax.loops import (
     to_float_time,
 )
 from physjax.particles import Particles, demand_particles
-from physjax.parts import ParticleSource
+from physjax.parts import ParticleSource, as_module
 from physjax.physics.emitters.appearance import Appearance, Look
 from physjax.physics.emitters.births import Birth, Key, apply_spread, draw_uniforms, read_key
 from physjax.physics.emitters.shapes import Source, direction_in_cone, unit_direction
@@ -58,12 +58,13 @@ LARGEST_BURST_CORRECTION = 1e6
 class Emitter(ParticleSource):
     """A pool of particles born from a source: `Scene(emitter.unborn(), ..., emitter=emitter)`.
 
-    From the time `start` [s] on, particles are born one by one at a `rate` [1/s], or in bursts of `burst` particles (by
-    default the whole pool) at intervals of `every` [s]; with neither, once. A particle leaves the source with a `speed`
-    [m/s] in a direction within the half-angle `cone` [rad] about `direction` (by default the outward normal of the source)
-    and lives for `life` [s]. Speed, life and size [m] of each particle are uniform within mean·(1 ± spread). `key` is a
-    seed or a `jax.random.key`. With `opposed`, bursts are of pairs with opposite velocities, so that their momentum is
-    zero.
+    From the time `start` [s] on, particles are born one by one at a `rate` [1/s], or in bursts of `burst` particles
+    (by default the whole pool) at intervals of `every` [s]; with neither, once. A particle leaves the source with a
+    `speed` [m/s] in a direction within the half-angle `cone` [rad] about `direction` (by default the outward normal
+    of the source) and lives for `life` [s]. Speed, life and size [m] of each particle are uniform within mean·(1 ±
+    spread). `key` is a seed or a `jax.random.key`. A source that moves has a `path(t) -> displacement` [m], `(dim,)`:
+    particles are born along it, each at its own time, with the velocity of the path added to theirs. With `opposed`,
+    bursts are of pairs with opposite velocities, so that their momentum is zero.
 
     All numbers but counts can be swept and differentiated (at fixed generations). Raises ValueError where a slot is needed
     before its particle has died, with the pool that is needed; with `drop_oldest` the oldest particle is replaced instead.
@@ -74,6 +75,11 @@ class Emitter(ParticleSource):
         >>> fountain = emitters.Emitter(8, emitters.Point((0.0, 0.0)), key=0, life=1.0, speed=5.0, rate=4.0)
         >>> print(fountain.birth_time(slot=jnp.array([0, 1, 2]), generation=jnp.array([0, 0, 1])))
         [0.   0.25 2.5 ]
+        >>> smoke = emitters.Emitter(
+        ...     8, emitters.Point((0.0, 0.0)), key=0, life=1.0, rate=4.0, path=lambda t: jnp.stack([10 * t, 0 * t])
+        ... )
+        >>> print(smoke.births(slot=jnp.array([1]), generation=jnp.array([0])).position)
+        [[2.5 0. ]]
     """
 
     memory: ClassVar[tuple[str, ...]] = ("generation", "born", "born_rest", "dies", "dies_rest")
@@ -88,6 +94,7 @@ class Emitter(ParticleSource):
     burst: int | None = eqx.field(static=True, default=None, kw_only=True)
     start: Numbers = quantity("start", "s", per=None, default=0.0, kw_only=True)
     direction: OptionalNumbers = quantity("direction", "1", kind="vector", per=None, default=None, kw_only=True)
+    path: Callable | None = eqx.field(default=None, kw_only=True)
     cone: Numbers = quantity(
         "half-angle of the cone", "rad", per=None, at_least=0, at_most=3.1416, default=0.0, kw_only=True
     )
@@ -110,6 +117,10 @@ class Emitter(ParticleSource):
         # an array, not a count: selected lanes keep the numbers of their slots
         self.slot = jnp.arange(self.pool, dtype=jnp.int32)
         self.start_rest = float32_remainder(self.start, self.start_rest)
+        if self.path is not None:
+            if not callable(self.path) or isinstance(self.path, type):
+                raise TypeError(f"path: got {self.path!r}, expected a function t -> displacement of the source [m].")
+            self.path = as_module(self.path)
         if self.generation is None:  # pyright: ignore[reportUnnecessaryComparison]  # given where `dataclasses.replace` changes a number during a run
             memory = _begin_memory(self.slot.size, jnp.result_type(float))
             self.generation, self.born, self.born_rest, self.dies, self.dies_rest = memory
@@ -225,13 +236,34 @@ class Emitter(ParticleSource):
         speed = apply_spread(self.speed, self.speed_spread, u[:, 5])
         if self.opposed:
             speed = jnp.where(slot % 2 == 0, speed, -speed)
+        velocity = scale(speed, direction_in_cone(axis, self.cone, u[:, 3:5]))
+        time = self.birth_time(slot, generation)
+        if self.path is not None:
+            displacement, source_velocity = self._move_source(time)
+            place, velocity = place + displacement, force_rounding(velocity) + source_velocity
         return Birth(
-            time=self.birth_time(slot, generation),
+            time=time,
             life=apply_spread(self.life, self.life_spread, u[:, 6]),
             size=apply_spread(self.size, self.size_spread, u[:, 7]),
             position=place,
-            velocity=scale(speed, direction_in_cone(axis, self.cone, u[:, 3:5])),
+            velocity=velocity,
         )
+
+    def _move_source(self, time: Array) -> tuple[Array, Array]:
+        """How far the source has moved at the time of each birth [m], and its velocity [m/s], in the dtype of the time."""
+
+        def displace(t: Array) -> Array:
+            assert self.path is not None
+            moved = jnp.asarray(self.path(t))
+            if moved.shape != (self.source.dim,) or not jnp.issubdtype(moved.dtype, jnp.number):
+                raise ValueError(
+                    f"path: got {moved.dtype} of shape {moved.shape} for a time, expected the displacement of the source "
+                    f"[m], of shape ({self.source.dim},)."
+                )
+            return moved.astype(time.dtype)
+
+        moved = jax.vmap(lambda t: jax.jvp(displace, (t,), (jnp.ones_like(t),)))(time)
+        return force_rounding(moved[0]), force_rounding(moved[1])
 
     def _draw(self, slot: Array, generation: Array) -> Array:
         """The uniform numbers of these births; the second of an opposed pair has those of the first."""

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -120,6 +121,30 @@ class Magnus(Force):
         return scale(0.5 * self.density * self.coefficient * self.area * norm(v), spin(axis, v))
 
 
+class Lorentz(Force):
+    """The force of electric and magnetic fields on a charge: F = q (E + v×B).
+
+    Charge q [C]. The magnetic field B [T] is a vector in space; in the plane it is a number, its component towards the
+    viewer. The electric field E [V/m] is a vector, by default none. Fields that depend on the place are a force of your
+    own. `methods.boris` keeps the speed in a magnetic field to rounding; others lose or gain it.
+
+    Example:
+        >>> print(forces.Lorentz(charge=2.0, magnetic=1.5, electric=(1.0, 0.0))(0.0, ball, shot.mass))
+        [14. -9.]
+    """
+
+    charge: Numbers = quantity("charge q", "C")
+    magnetic: Numbers = quantity("magnetic field B", "T", kind="axial")
+    electric: OptionalNumbers = quantity("electric field E", "V/m", kind="vector", default=None)
+
+    def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
+        """q (E + v×B) [N]."""
+        field = -spin(self.magnetic, state.velocity)
+        if self.electric is not None:
+            field = field + broadcast_vector(self.electric, state.velocity)
+        return scale(self.charge, field)
+
+
 class RotatingFrame(Field):
     """The inertial forces of a rotating frame: centrifugal -mω×(ω×r), Coriolis -2mω×v and, where ω changes, Euler's -mω̇×r.
 
@@ -148,17 +173,28 @@ class Anchor(Force):
     """A damped spring from a fixed point: F = -k (|d| - L) d̂ - c (v·d̂) d̂, with d = x - point.
 
     Without a rest length L [m] it is the isotropic harmonic oscillator, F = -k d - c v. Stiffness k [N/m], damping c
-    [kg/s].
+    [kg/s]. With `tension_only` it is a rope, which pulls where it is longer than L and is slack where it is not; damping
+    then never makes it push. Raises ValueError for a rope without a rest length.
 
     Example:
         >>> print(forces.Anchor(point=(1.0, 8.0), stiffness=5.0)(0.0, ball, shot.mass))
         [  5. -10.]
+        >>> rope = forces.Anchor(point=(3.0, 10.0), stiffness=5.0, rest_length=4.0, tension_only=True)
+        >>> print(rope(0.0, ball, shot.mass), rope(0.0, Particles(jnp.array([3.0, 5.0]), jnp.zeros(2)), shot.mass))
+        [0. 0.] [0. 5.]
     """
 
     point: Numbers = quantity("anchor point", "m", kind="place")
     stiffness: Numbers = quantity("stiffness", "N/m", at_least=0)
     rest_length: OptionalNumbers = quantity("rest length", "m", at_least=0, default=None)
     damping: OptionalNumbers = quantity("damping", "kg/s", at_least=0, default=None)
+    tension_only: bool = eqx.field(static=True, default=False, kw_only=True)
+
+    def __check_init__(self):
+        if self.tension_only and self.rest_length is None:
+            raise ValueError(
+                "Anchor: got tension_only=True without a rest length, expected rest_length= [m]: a rope is slack below it."
+            )
 
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes dim"]:
         """The pull of the spring [N]."""
@@ -170,12 +206,19 @@ class Anchor(Force):
         tension = self.stiffness * (norm(d) - self.rest_length)
         if self.damping is not None:
             tension = tension + self.damping * dot(state.velocity, along)
+        if self.tension_only:
+            tension = jnp.where(norm(d) > self.rest_length, jnp.maximum(tension, 0.0), 0.0)
         return scale(-tension, along)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*lanes"]:
-        """½k(|d| - L)² [J]."""
+        """½k(|d| - L)² [J], zero where a rope is slack."""
         d = state.position - broadcast_vector(self.point, state.position)
-        return 0.5 * self.stiffness * (dot(d, d) if self.rest_length is None else (norm(d) - self.rest_length) ** 2)
+        if self.rest_length is None:
+            return 0.5 * self.stiffness * dot(d, d)
+        stretch = norm(d) - self.rest_length
+        if self.tension_only:
+            stretch = jnp.maximum(stretch, 0.0)
+        return 0.5 * self.stiffness * stretch**2
 
 
 def independent(force: Callable[..., Array]) -> Function:
@@ -202,7 +245,7 @@ def _broadcast_omega(omega: Array, r: Array) -> Array:
     return jnp.broadcast_to(omega, r.shape[:-1]) if r.shape[-1] == 2 else broadcast_vector(omega, r)
 
 
-__all__ = ["Anchor", "Magnus", "QuadraticDrag", "RotatingFrame", "SphereDrag", "StokesDrag", "independent"]
+__all__ = ["Anchor", "Lorentz", "Magnus", "QuadraticDrag", "RotatingFrame", "SphereDrag", "StokesDrag", "independent"]
 
 
 def __dir__() -> list[str]:

@@ -41,7 +41,8 @@ class ContactPointState(NamedTuple):
     """Contact points at their surfaces, the points first: `points` on the hull, `center` a radius [m] above each.
 
     `signed_distance` [m] is that of the hull. `turning` is how fast the normal turns below the moving center [1/s], with
-    the radius; None where all surfaces are flat.
+    the radius; None where all surfaces are flat. `carried_rate` [m/s²] is how fast the velocity of the surface changes
+    where the moving point touches it; None where none turns.
     """
 
     points: Points
@@ -49,6 +50,7 @@ class ContactPointState(NamedTuple):
     signed_distance: Array
     restitution: Array
     turning: tuple[Array, Array] | None
+    carried_rate: Array | None
 
 
 class PointContact(Contact):
@@ -128,7 +130,7 @@ def gather_point_states(
 ) -> ContactPointState:
     """Every point of every hull at its surface, joined along the axis of points.
 
-    What only some surfaces have, curvature or friction, is zero at the others.
+    What only some surfaces have, curvature, friction or a turn of their own, is zero at the others.
     """
     parts = _map_points(kinds, lambda contact: contact.point_state(to_float_time(t), state, velocities))
     if len(parts) == 1:
@@ -140,6 +142,9 @@ def gather_point_states(
         zero = lambda part: (jnp.zeros_like(part.signed_distance), jnp.zeros_like(part.signed_distance))  # noqa: E731
         rough = [part.points._replace(friction=part.points.friction or zero(part)) for part in parts]
         parts = [part._replace(points=points) for part, points in zip(parts, rough, strict=True)]
+    if any(part.carried_rate is not None for part in parts):
+        still = lambda part: jnp.zeros_like(part.points.normal)  # noqa: E731
+        parts = [p if p.carried_rate is not None else p._replace(carried_rate=still(p)) for p in parts]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 

@@ -179,6 +179,9 @@ def _advance_points(here: Place, load: WholeWrench, ahead: Array) -> Points:
     if point_state.turning is not None:
         turning, _ = point_state.turning
         faster = faster + scale(dot(turning, points.velocity), points.normal)
+    if point_state.carried_rate is not None:
+        # a surface that turns is faster further out, where the point that touches will be
+        faster = faster - point_state.carried_rate
     return points._replace(velocity=points.velocity + scale(jnp.broadcast_to(ahead, faster.shape[:-1]), faster))
 
 

@@ -84,13 +84,20 @@ class SurfaceContact(PointContact):
         per_point = lambda number: jnp.broadcast_to(number, time.shape)  # noqa: E731
         dry = self.surface.coulomb
         friction = None if dry is None else (per_point(dry.static), per_point(dry.kinetic))
-        points = Points(low, normal, self.surface.relative(straight + cross(omega, low)), friction)
-        turning = None
+        touch = Particles(bodies.position[None] + low, straight + cross(omega, low))
+        points = Points(low, normal, self.surface.slip(time, touch), friction)
+        turning, moves = None, center.velocity
         if self.surface.curved:
             along = self.surface.relative(center.velocity)
             turning = self.surface.normal_rate(time, where, along), self._radius(arm)
+            moves = moves - scale(turning[1], turning[0])
         return ContactPointState(
-            points, center, self.signed_distance(time, where), per_point(self.surface.restitution), turning
+            points,
+            center,
+            self.signed_distance(time, where),
+            per_point(self.surface.restitution),
+            turning,
+            self.surface.velocity_rate(moves),
         )
 
     def walls(self) -> tuple["SurfaceContact", ...]:

@@ -23,7 +23,8 @@ class Springs(Force):
     `pairs` `(springs, 2)` are indices into the last lane axis. Stiffness k [N/m], rest length L [m] and damping c
     [kg/s] are numbers for all springs or one each, `(springs,)`; leading axes of scenes make a sweep of them. Coinciding
     ends have no line between them and no force. With `breaks_at`, a strain (l - L)/L, a spring that is stretched beyond it
-    breaks for good, and a run records which are `unbroken`. `nodes` is the number of nodes, if the pairs do not name the
+    breaks for good, and a run records which are `unbroken`. With `tension_only` they are ropes, which pull where they are
+    longer than L and are slack where they are not. `nodes` is the number of nodes, if the pairs do not name the
     last. `layout` is "bands" (shifted slices, for lattices) or "gather" (for meshes), by default the faster. Raises
     ValueError or TypeError for pairs that are not pairs of different nodes, numbers < 0 and shapes that do not match.
 
@@ -42,6 +43,7 @@ class Springs(Force):
     c: Float[Array, "..."] | None = unchecked_quantity("damping", "kg/s", per="spring", at_least=0)
     limit: Float[Array, "..."] | None = unchecked_quantity("breaks_at", per="spring", at_least=0)
     intact: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="spring")
+    tension_only: bool = eqx.field(static=True, default=False)
 
     def __init__(
         self,
@@ -53,7 +55,9 @@ class Springs(Force):
         *,
         nodes: int | None = None,
         layout: str | None = None,
+        tension_only: bool = False,
     ):
+        self.tension_only = tension_only
         self.topology = SpringTopology(pairs, None if nodes is None else as_positive_integer("nodes", nodes), layout)
         self.k = self._lay_out("stiffness [N/m]", stiffness)
         self.L = self._lay_out("rest length [m]", rest_length)  # pyright: ignore[reportConstantRedefinition]  # a length
@@ -118,6 +122,8 @@ class Springs(Force):
             pull = k * (apart - L * square_root(square))
             if c is not None:
                 pull = pull + self._take_slot(slot, c, d) * product(d, parts[1][slot])
+            if self.tension_only:
+                pull = jnp.where(square > L * L, jnp.maximum(pull, 0.0), 0.0)
             # the division comes last because older compilers materialise a division by themselves
             weights.append(jnp.where(self._take_unbroken(slot, d), pull, 0.0) / apart)
         near = topology.neighbours
@@ -130,21 +136,23 @@ class Springs(Force):
         for slot, (edge, d) in enumerate(zip(edges, parts, strict=True)):
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
-            unbroken = self._take_unbroken(slot, d)
+            L, unbroken = self._take_slot(slot, self.L, d), self._take_unbroken(slot, d)
+            if self.tension_only:
+                unbroken = unbroken & (square > L * L)
             k = jnp.where(unbroken, self._take_slot(slot, self.k, d), 0.0)
-            g, h = spring_jacobian_coefficients(
-                k, self._take_slot(slot, self.L, d) * square_root(square) / apart, apart
-            )
+            g, h = spring_jacobian_coefficients(k, L * square_root(square) / apart, apart)
             gamma = None if self.c is None else jnp.where(unbroken, self._take_slot(slot, self.c, d), 0.0) / apart
             springs.append(LinearisedSlot(edge, d, g, h, gamma))
         return LinearisedSprings(self.topology, state, self(to_float_time(t), state, mass), springs)
 
     def potential(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes"]:
-        """½k(l - L)² [J], half of it at each end."""
+        """½k(l - L)² [J], half of it at each end, zero where a rope is slack."""
         self._demand_nodes(state)
         energies = []
         for slot, d in enumerate(self.topology.parts(state.position)):
             stretch = square_root(product(d, d)) - self._take_slot(slot, self.L, d)
+            if self.tension_only:
+                stretch = jnp.maximum(stretch, 0.0)
             energy = 0.25 * self._take_slot(slot, self.k, d) * stretch * stretch
             energies.append(jnp.where(self._take_unbroken(slot, d), energy, 0.0))
         return self.topology.neighbours.sum_at_both_ends(energies)
@@ -183,19 +191,23 @@ class Springs(Force):
         return (length - rest_length) / rest_length
 
     def tension(self, state: Particles) -> Float[Array, "*scenes springs"]:
-        """k (l - L) + c l̇ of each spring [N]: positive when it pulls, zero when it is broken."""
+        """k (l - L) + c l̇ of each spring [N]: positive when it pulls, zero when it is broken, or a rope that is slack."""
         length = self.length(state)
         stiffness, rest_length = (add_leading_axes(n, length.ndim) for n in (self.stiffness, self.rest_length))
         tension = stiffness * (length - rest_length)
         if self.damping is not None:
             rate = dot(unit(self._edge_vectors(state.position)), self._edge_vectors(state.velocity))
             tension = tension + add_leading_axes(self.damping, length.ndim) * rate
+        if self.tension_only:
+            tension = jnp.where(length > rest_length, jnp.maximum(tension, 0.0), 0.0)
         return self._zero_broken(tension)
 
     def energy(self, state: Particles) -> Float[Array, "*scenes springs"]:
-        """½k(l - L)² of each spring [J], zero when it is broken."""
+        """½k(l - L)² of each spring [J], zero when it is broken, or a rope that is slack."""
         length = self.length(state)
         stretch = length - add_leading_axes(self.rest_length, length.ndim)
+        if self.tension_only:
+            stretch = jnp.maximum(stretch, 0.0)
         return self._zero_broken(0.5 * add_leading_axes(self.stiffness, length.ndim) * stretch * stretch)
 
     def _take_unbroken(self, slot: int, like: list[Array]) -> Array | np.ndarray:

@@ -164,7 +164,12 @@ def _list_simpler_springs(springs: Springs) -> list[tuple[str, Part]]:
     def select_springs(kept, damping=damping):
         options = [None if a is None else a[kept] for a in (damping, breaks_at)]
         return Springs(
-            np.asarray(springs.pairs)[kept], stiffness[kept], rest_length[kept], *options, nodes=springs.nodes
+            np.asarray(springs.pairs)[kept],
+            stiffness[kept],
+            rest_length[kept],
+            *options,
+            nodes=springs.nodes,
+            tension_only=springs.tension_only,
         )
 
     simpler: list[tuple[str, Part]] = []

@@ -111,7 +111,9 @@ def list_methods(scene: Scene) -> dict[str, Callable]:
         suits = lambda promises: promises.order <= (1 if np.isinf(promises.stability_limit) else CONTACT_ORDER)  # noqa: E731
         return {name: method for name, method in METHODS.items() if suits(method.promises)}
     special = not scene.state.rotates and not depends_on_velocity(scene)
-    return METHODS | SPECIAL_METHODS if special else dict(METHODS)
+    # one that keeps its order with drag is made for forces of velocity
+    of_place = {name: m for name, m in SPECIAL_METHODS.items() if m.promises.order_with_drag < m.promises.order}
+    return METHODS | of_place if special else dict(METHODS)
 
 
 def list_adaptive_methods(scene: Scene) -> list[Adaptive]:

@@ -41,10 +41,18 @@ CASES = {
     "QuadraticDrag": Case(forces.QuadraticDrag, {"area": 0.1, "coefficient": 0.4, "density": 1.2}, WIND, 3),
     "QuadraticDrag in still air": Case(forces.QuadraticDrag, {"area": 0.1, "coefficient": 0.4}, {}, 2),
     "SphereDrag": Case(forces.SphereDrag, {"radius": 0.1, "density": 1.2, "viscosity": 1.8e-5}, WIND, 3),
+    "TabulatedDrag": Case(
+        lambda **n: forces.TabulatedDrag([0.0, 1.0, 3.0], [0.4, 0.9, 0.6], **n),
+        {"area": 0.1, "density": 1.2, "speed_of_sound": 1.5},
+        WIND,
+        3,
+    ),
     "Magnus": Case(forces.Magnus, {"area": 0.1, "coefficient": 0.4, "density": 1.2}, WIND | {"axis": [1.0, 2, -3]}, 3),
     "Magnus in the plane": Case(forces.Magnus, {"area": 0.1, "coefficient": 0.4, "axis": -2.0}, {}, 2),
     "Buoyancy": Case(forces.Buoyancy, {"density": 1e3, "volume": 1e-3, "g": 9.8}, {}, 2),
     "Buoyancy at a surface": Case(forces.Buoyancy, {"density": 1e3, "radius": 0.8, "surface": 0.1, "g": 9.8}, {}, 2),
+    "Lorentz": Case(forces.Lorentz, {"charge": 0.3}, {"magnetic": [1.0, 2.0, -3.0], "electric": [0.2, 0.0, 0.5]}, 3),
+    "Lorentz in the plane": Case(forces.Lorentz, {"charge": 0.3, "magnetic": -2.0}, {}, 2),
     "RotatingFrame": Case(forces.RotatingFrame, {}, {"omega": [0.4, 1.0, -0.3]}, 3),
     "RotatingFrame, changing": Case(
         forces.RotatingFrame, {}, {"omega": [0.4, 1.0, -0.3], "omega_rate": [0.2, 0.0, 0.5]}, 3
