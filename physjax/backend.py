@@ -33,8 +33,6 @@ from jaxtyping import Array, Bool, Int, PyTree
 T = TypeVar("T")
 """A tree of arrays that comes back with the same structure and shapes."""
 
-WORLDS_PER_GROUP = 32
-"""Worlds that are swept at a time, where only some have impacts."""
 MIN_LANES_TO_SELECT = 1024
 """Below this many lanes computing all of them costs less than gathering and scattering those that are flagged."""
 GROUPS_PER_SCENE = 32
@@ -311,15 +309,6 @@ def choose_group_lanes(lanes: int) -> int | None:
     """
     size = max(math.ceil(lanes / GROUPS_PER_SCENE), 1 if on_cpu() else MIN_GROUP_LANES_ON_GPU)
     return None if lanes < MIN_LANES_TO_SELECT or lanes <= 2 * size else size
-
-
-def choose_group_worlds(worlds: int) -> int | None:
-    """How many worlds of bodies that touch are solved at a time while impacts go on in some; None for all of them.
-
-    On a CPU a sweep over 32 worlds takes little longer than over one, and over 1024 ten times as long: 1024 worlds of four bodies
-    that tumble take 7.5 s for 150 steps in groups of 32, 14 in groups of 128, and 115 without.
-    """
-    return WORLDS_PER_GROUP if on_cpu() and worlds >= 2 * WORLDS_PER_GROUP else None
 
 
 def count_lane_blocks(lanes: int, steps_per_frame: int) -> int | None:

@@ -10,10 +10,22 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
-from physjax.backend import GROUPS_PER_SCENE, any_lane, choose_group_lanes
+from physjax.backend import GROUPS_PER_SCENE, any_lane, choose_group_lanes, on_cpu
+
+WORLDS_PER_GROUP = 32
+"""Worlds that are swept at a time, where only some have impacts."""
 
 T = TypeVar("T")
 """A tree of arrays that comes back with the same structure and shapes."""
+
+
+def choose_group_worlds(worlds: int) -> int | None:
+    """How many worlds of bodies that touch are solved at a time while impacts go on in some; None for all of them.
+
+    On a CPU a sweep over 32 worlds takes little longer than over one, and over 1024 ten times as long: 1024 worlds of four bodies
+    that tumble take 7.5 s for 150 steps in groups of 32, 14 in groups of 128, and 115 without.
+    """
+    return WORLDS_PER_GROUP if on_cpu() and worlds >= 2 * WORLDS_PER_GROUP else None
 
 
 def compact_and_apply(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from physjax.backend import choose_group_worlds
+from physjax.compaction import choose_group_worlds
 from physjax.loops import differentiable_while_loop
 from physjax.physics.rigid.planar.impulses import (
     Contacts,

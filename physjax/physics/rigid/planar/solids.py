@@ -98,6 +98,10 @@ class Solids(Contact):
                     "Solids: got a surface with friction= or response=, expected coulomb=Coulomb(static, kinetic) or "
                     "nothing: the others are for particles."
                 )
+            if surface.angular_velocity is not None:
+                raise ValueError(
+                    "Solids: got a surface with angular_velocity=, expected one that does not turn: use velocity=, or a body."
+                )
 
     @property
     def response(self) -> Callable[..., Scene]:  # pyright: ignore[reportIncompatibleVariableOverride]  # as in `Surface`
