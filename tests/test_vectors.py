@@ -118,7 +118,8 @@ def test_the_table_of_expected_values_misses_no_helper():
     import physjax.vectors as module
 
     ours = {name: f for name, f in vars(module).items() if getattr(f, "__module__", "") == module.__name__}
-    public = {name for name, f in ours.items() if not isinstance(f, TypeVar)}
+    # old names of a function are the function
+    public = {name for name, f in ours.items() if not isinstance(f, TypeVar) and f.__name__ == name}
     named = {word.strip(",") for name in expected(*some(2, np.float64)) for word in name.split()[:1]}
     assert {name for name in public if not name.startswith("_")} == named | {"add_trailing_axes", "add_leading_axes"}
 

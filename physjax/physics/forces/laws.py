@@ -180,8 +180,9 @@ class Anchor(Force):
         >>> print(forces.Anchor(point=(1.0, 8.0), stiffness=5.0)(0.0, ball, shot.mass))
         [  5. -10.]
         >>> rope = forces.Anchor(point=(3.0, 10.0), stiffness=5.0, rest_length=4.0, tension_only=True)
-        >>> print(rope(0.0, ball, shot.mass), rope(0.0, Particles(jnp.array([3.0, 5.0]), jnp.zeros(2)), shot.mass))
-        [0. 0.] [0. 5.]
+        >>> slack, taut = (Particles(jnp.array(place), jnp.zeros(2)) for place in ((3.0, 7.0), (0.0, 6.0)))
+        >>> print(jnp.linalg.norm(rope(0.0, slack, shot.mass)), rope(0.0, taut, shot.mass))
+        0.0 [3. 4.]
     """
 
     point: Numbers = quantity("anchor point", "m", kind="place")

@@ -280,6 +280,9 @@ def test_what_does_not_fit_is_refused_in_plain_words():
         Scene(rigid.bodies(inertia.sphere(1.0, 1.0)), inertia.sphere(1.0, 1.0), contacts=(rigid.Solids(SQUARE),))
     with pytest.raises(TypeError, match="PlanarShape"):
         rigid.Solids([(1.0, 1.0)])
+    drum = contacts.Sphere((0.0, 0.0), 1.0, angular_velocity=1.0)
+    with pytest.raises(ValueError, match="does not turn"):
+        rigid.Solids(SQUARE, (drum,))
     many = rigid.planar_bodies(CRATE, np.zeros((65, 2)))
     with pytest.raises(ValueError, match="at most 64"):
         Scene(many, CRATE, contacts=(rigid.Solids(SQUARE),))
