@@ -9,9 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.checks import OptionalNumbers, as_real_quantity, concrete_or_none
+from physjax.checks import (
+    OptionalNumbers,
+    as_positive_integer,
+    as_real_quantity,
+    concrete_or_none,
+    quantity,
+    unchecked_quantity,
+)
 from physjax.constraints.coordinates import Coordinates, Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
@@ -34,10 +41,16 @@ class Constraint(Force):
 
     couples: ClassVar[bool] = True
     pairs: eqx.AbstractVar[Pairs]
-    order: eqx.AbstractVar[int]
-    substeps: eqx.AbstractVar[int]
-    breaks_at: eqx.AbstractVar[OptionalNumbers]
-    unbroken: eqx.AbstractVar[Array | None]
+    order: int = eqx.field(static=True, default=2, kw_only=True)
+    substeps: int = eqx.field(static=True, default=1, kw_only=True)
+    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None, kw_only=True)
+    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None, kw_only=True)
+
+    def set_options(self, order: int, substeps: int, breaks_at: ArrayLike | Sequence | None) -> None:
+        """Check what all kinds of joints are given, for their constructors; nothing has broken yet."""
+        self.order, self.substeps = _demand_order(type(self).__name__, order), as_positive_integer("substeps", substeps)
+        self.breaks_at = None if breaks_at is None else as_real_quantity("breaks_at [N]", breaks_at, above=0.0)
+        self.unbroken = None
 
     @property
     @abstractmethod
@@ -123,7 +136,7 @@ class Constraint(Force):
 
 
 def check_joint_pairs(name: str, pairs: ArrayLike | Sequence, places: int | None) -> Pairs:
-    """Pairs of different bodies as tuples; below 0 are places in the world, of which there are so many (None: any number)."""
+    """Pairs of different bodies as tuples; below 0 are places in the world, `places` of them (None: any number)."""
     given = np.asarray(pairs)
     if given.dtype.kind not in "iu" or given.ndim != 2 or given.shape[1:] != (2,) or not given.size:
         raise ValueError(f"{name}: got pairs {given.tolist()}, expected (joints, 2) indices of different bodies.")
@@ -139,16 +152,11 @@ def check_joint_pairs(name: str, pairs: ArrayLike | Sequence, places: int | None
     return tuple((int(i), int(j)) for i, j in given)
 
 
-def demand_order(name: str, order: int) -> int:
+def _demand_order(name: str, order: int) -> int:
     """The order of the step, if it is one that there is."""
     if order not in ORDERS:
         raise ValueError(f"{name}: got order={order!r}, expected one of {ORDERS}.")
     return order
-
-
-def check_limit(breaks_at: ArrayLike | Sequence | None) -> Array | None:
-    """The force [N] at which joints break, if they do."""
-    return None if breaks_at is None else as_real_quantity("breaks_at [N]", breaks_at, above=0.0)
 
 
 def remember_breaks(part: C, state: PyTree) -> C:
@@ -208,9 +216,7 @@ def spread_unbroken(part: Constraint, worlds: int, dtype: np.dtype) -> Float[Arr
 __all__ = [
     "Constraint",
     "check_joint_pairs",
-    "check_limit",
     "demand_closed",
-    "demand_order",
     "remember_breaks",
     "spread_unbroken",
 ]

@@ -32,7 +32,7 @@ Ends = tuple[list[Array], list[Array]]
 class BodyJoints(Constraint, Load):
     """Joints between a point of each of two bodies, in their frames; of the world, index -1, the point is its place."""
 
-    points: eqx.AbstractVar[Array]
+    points: eqx.AbstractVar[Array]  # pyright: ignore[reportGeneralTypeIssues]  # all of them are set by constructors
 
     @property
     def reader(self) -> BodyCoordinates:

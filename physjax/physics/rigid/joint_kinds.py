@@ -7,17 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from physjax.checks import (
     OptionalNumbers,
-    as_positive_integer,
     as_real_quantity,
     demand_direction,
     quantity,
     unchecked_quantity,
 )
-from physjax.constraints.constraint import check_limit, demand_order
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.physics.rigid.body_joints import (
@@ -46,10 +44,6 @@ class Welds(BodyJoints):
     pairs: Pairs = eqx.field(static=True)
     points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     turns: Float[Array, "..."] | None = unchecked_quantity("turn at the start", "rad", per="joint", default=None)
-    order: int = eqx.field(static=True, default=2)
-    substeps: int = eqx.field(static=True, default=1)
-    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
-    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -61,8 +55,7 @@ class Welds(BodyJoints):
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Welds", pairs, points)
-        self.order, self.substeps = demand_order("Welds", order), as_positive_integer("substeps", substeps)
-        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        self.set_options(order, substeps, breaks_at)
         self.turns = None
 
     @property
@@ -101,10 +94,6 @@ class Hinges(BodyJoints):
     pairs: Pairs = eqx.field(static=True)
     points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     axis: Float[Array, "joints 2 3"] = unchecked_quantity("axis", "1", kind="vector", per=None)
-    order: int = eqx.field(static=True, default=2)
-    substeps: int = eqx.field(static=True, default=1)
-    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
-    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -123,8 +112,7 @@ class Hinges(BodyJoints):
             )
         axis = _check_axis("Hinges", axis, len(self.pairs), 3)
         self.axis = jnp.broadcast_to(axis if axis.ndim == 3 else axis[:, None], self.points.shape)
-        self.order, self.substeps = demand_order("Hinges", order), as_positive_integer("substeps", substeps)
-        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        self.set_options(order, substeps, breaks_at)
 
     @property
     def rows(self) -> int:
@@ -162,10 +150,6 @@ class Sliders(BodyJoints):
     points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     axis: Float[Array, "joints dim"] = unchecked_quantity("axis", "1", kind="vector", per=None)
     turns: Float[Array, "..."] | None = unchecked_quantity("turn at the start", "rad", per="joint", default=None)
-    order: int = eqx.field(static=True, default=2)
-    substeps: int = eqx.field(static=True, default=1)
-    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
-    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -180,8 +164,7 @@ class Sliders(BodyJoints):
         self.pairs, self.points = check_joints("Sliders", pairs, points)
         dim = self.points.shape[-1]
         self.axis = jnp.broadcast_to(_check_axis("Sliders", axis, len(self.pairs), dim), (len(self.pairs), dim))
-        self.order, self.substeps = demand_order("Sliders", order), as_positive_integer("substeps", substeps)
-        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        self.set_options(order, substeps, breaks_at)
         self.turns = None
 
     @property
@@ -222,10 +205,6 @@ class Rods(BodyJoints):
     pairs: Pairs = eqx.field(static=True)
     points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     length: OptionalNumbers = quantity("length", "m", per="joint", above=0, default=None)
-    order: int = eqx.field(static=True, default=2)
-    substeps: int = eqx.field(static=True, default=1)
-    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
-    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -239,8 +218,7 @@ class Rods(BodyJoints):
     ):
         self.pairs, self.points = check_joints("Rods", pairs, points)
         self.length = None if length is None else as_real_quantity("length [m]", length, above=0.0)
-        self.order, self.substeps = demand_order("Rods", order), as_positive_integer("substeps", substeps)
-        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        self.set_options(order, substeps, breaks_at)
 
     @property
     def rows(self) -> int:

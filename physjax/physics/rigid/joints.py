@@ -7,17 +7,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from physjax.checks import (
     Numbers,
     OptionalNumbers,
-    as_positive_integer,
     as_real_quantity,
     quantity,
     unchecked_quantity,
 )
-from physjax.constraints.constraint import check_limit, demand_order
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
@@ -55,10 +53,6 @@ class Joints(BodyJoints):
     points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     stiffness: OptionalNumbers = quantity("stiffness k", "N/m", per="joint", above=0, default=None)
     damping: Numbers = quantity("damping c", "kg/s", per="joint", at_least=0, default=0.0)
-    order: int = eqx.field(static=True, default=2)
-    substeps: int = eqx.field(static=True, default=1)
-    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
-    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -74,8 +68,7 @@ class Joints(BodyJoints):
         self.pairs, self.points = check_joints("Joints", pairs, points)
         self.stiffness = None if stiffness is None else as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
-        self.order, self.substeps = demand_order("Joints", order), as_positive_integer("substeps", substeps)
-        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        self.set_options(order, substeps, breaks_at)
         if self.stiffness is not None and breaks_at is not None:
             raise ValueError("Joints: got a stiffness and breaks_at, expected one of them: springs do not break.")
         if self.stiffness is not None and (np.asarray(self.pairs) < 0).any():

@@ -7,15 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from physjax.checks import OptionalNumbers, as_positive_integer, as_real_quantity, quantity, unchecked_quantity
+from physjax.checks import OptionalNumbers, as_real_quantity, quantity, unchecked_quantity
 from physjax.constraints.constraint import (
     Constraint,
     check_joint_pairs,
-    check_limit,
     demand_closed,
-    demand_order,
     remember_breaks,
 )
 from physjax.constraints.coordinates import Places, PointCoordinates
@@ -51,10 +49,6 @@ class Rods(Constraint):
     anchors: Float[Array, "anchors dim"] | None = unchecked_quantity(
         "anchors", "m", kind="place", per=None, default=None
     )
-    order: int = eqx.field(static=True, default=2)
-    substeps: int = eqx.field(static=True, default=1)
-    breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None)
-    unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None)
 
     def __init__(
         self,
@@ -74,9 +68,7 @@ class Rods(Constraint):
         if lengths is not None and lengths.ndim and lengths.shape[-1] not in (1, len(self.pairs)):
             raise ValueError(f"Rods: got lengths {lengths.shape}, expected () or ({len(self.pairs)},), one for each.")
         self.length = lengths
-        self.order = demand_order("Rods", order)
-        self.substeps = as_positive_integer("substeps", substeps)
-        self.breaks_at, self.unbroken = check_limit(breaks_at), None
+        self.set_options(order, substeps, breaks_at)
 
     def __call__(self, t: Time, state: Particles, mass: Array) -> Float[Array, "*lanes dim"]:
         """No force of its own: the scene's motion is kept on the rods."""
