@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FRONT_BAND_STYLE = {"color": "#F0E442", "linewidth": 9, "alpha": 0.5, "solid_capstyle": "round"}
-"""Pareto's front."""
+"""The Pareto front."""
 SMALLEST_DRAWN_ERROR = 1e-17
 """Errors of 0 are drawn here, below any rounding, since a logarithmic axis has no 0."""
 LEGEND_LINE_INCHES, LEGEND_MARGIN_INCHES, SMALLEST_LEGEND_INCHES = 0.207, 0.63, 1.53
@@ -31,7 +31,7 @@ Number = Callable[[Run], float | None]
 def draw_work_precision(result: WorkPrecision, figure: "Figure | None" = None) -> "Figure":
     """Four panels of an `accuracy.WorkPrecision`: path, error against time, error against step, drift (or evaluations).
 
-    Runs that failed stand as crosses on the upper edge, where they died; Pareto's front is a band. Where gradients or
+    Runs that failed stand as crosses on the upper edge, where they died; the Pareto front is a band. Where gradients or
     other norms were studied, two more panels show them against time. Returns the figure.
     """
     from matplotlib import pyplot as plt
@@ -63,7 +63,7 @@ def _draw_path(ax: "Axes", result: WorkPrecision) -> None:
 
 
 def _draw_errors(against_time: "Axes", against_step: "Axes", result: WorkPrecision) -> None:
-    """Error on the path against run time, with Pareto's front, and against the step."""
+    """Error on the path against run time, with the Pareto front, and against the step."""
     _draw_curves(against_time, result, lambda run: run.seconds, _path_error, floor=result.floor)
     against_time.set(xlabel="run time [s]", ylabel=PATH_ERROR_LABEL)
     against_time.set_title("speed against accuracy: lower left is better", fontsize=11)
@@ -105,7 +105,7 @@ def _path_error(run: Run) -> float:
 
 
 def _draw_front(ax: "Axes", front: Sequence[Run]) -> None:
-    """Pareto's front, behind the lines."""
+    """The Pareto front, behind the lines."""
     errors = [max(run.path_error, SMALLEST_DRAWN_ERROR) for run in front]
     ax.plot([run.seconds for run in front], errors, **FRONT_BAND_STYLE, zorder=0)
 
@@ -157,7 +157,7 @@ def _draw_legend(figure: "Figure", result: WorkPrecision) -> float:
     handles = [Line2D([], [], **_style_of(result, method), label=_format_label(result, method)) for method in methods]
     failed = Line2D([], [], color="0.2", marker="x", linestyle="", label="failed (upper edge)")
     handles.insert(len(methods) // 2 if projected else len(methods), failed)
-    handles.append(Line2D([], [], **FRONT_BAND_STYLE, label="Pareto's front"))
+    handles.append(Line2D([], [], **FRONT_BAND_STYLE, label="Pareto front"))
     columns = 2 if projected else 3
     title = (
         "solid: impacts found inside the step; dashed, hollow: projected at the end of the step" if projected else None

@@ -134,7 +134,7 @@ class WorkPrecision(NamedTuple):
 
     @property
     def front(self) -> tuple[Run, ...]:
-        """Pareto's front: the runs that no other beats in both time and error, from fast to accurate."""
+        """The Pareto front: the runs that no other beats in both time and error, from fast to accurate."""
         front: list[Run] = []
         for run in sorted((run for run in self.runs if run.status == "ok"), key=lambda run: run.seconds):
             if not front or run.path_error < front[-1].path_error:
