@@ -50,6 +50,7 @@ FLOORS = (
     {"show"},
     {"study"},
     {"scenes"},
+    {"live"},
     {"cli"},
     {"__main__"},
 )

@@ -5,10 +5,10 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from physjax.cli import aim, chart, scenes, stability, sweep, warm
+from physjax.cli import aim, chart, explore, scenes, stability, sweep, warm
 from physjax.compiling import cache
 
-COMMANDS = (chart, scenes, stability, aim, sweep, warm)
+COMMANDS = (chart, explore, scenes, stability, aim, sweep, warm)
 """In the order in which `physjax --help` lists them."""
 
 
