@@ -51,6 +51,8 @@ from physjax.quantities import (
     may_hide_lanes,
 )
 from physjax.stages import Stage, advance_force, close_joints, prescribe, resolve_contact
+from physjax.summaries import describe_scene, write_summary, write_table
+from physjax.trials import find_faulty_force
 
 
 def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
@@ -129,6 +131,8 @@ class Scene(eqx.Module):
         for contact in self.contacts:
             contact.demand_fit(state, mass)
         self.forces = tuple(force.prepare(state, mass) for force in self.forces)
+        if (fault := find_faulty_force(state, mass, self.forces)) is not None:
+            raise TypeError(fault)
         self.state = state = mark_invalid_lanes(
             state, mass, (*self.forces, *self.contacts, pinned, emitter), self.contacts
         )
@@ -136,6 +140,13 @@ class Scene(eqx.Module):
         self.pinned = pinned
         self.reaction = None
         self.emitter = None if emitter is None else emitter.prepare(self)
+
+    def __repr__(self) -> str:
+        """What moves, and every part with its numbers and units."""
+        return write_summary(*describe_scene(self))
+
+    def _repr_html_(self) -> str:
+        return write_table(*describe_scene(self))
 
     @property
     def couples(self) -> bool:

@@ -67,7 +67,8 @@ def simulate(
         raise TypeError(f"simulate: got a {type(scene).__name__}, expected a Scene.")
     if not callable(method):
         raise TypeError(
-            f"simulate: got the method {method!r}, expected a function (system, t, state, dt) -> state, e.g. methods.rk4."
+            f"simulate: got a {type(method).__name__} as the method, expected a function (system, t, state, dt) -> state, "
+            "e.g. methods.rk4."
         )
     if record is not None and not callable(record):
         raise TypeError(f"record: got {record!r}, expected a function (t, state) -> what to keep.")
