@@ -4,7 +4,7 @@
 """
 
 from physjax.live.engine import Engine
-from physjax.live.explore import Explorer, explore
+from physjax.live.explorer import Explorer, explore
 
 __all__ = ["Engine", "Explorer", "explore"]
 
