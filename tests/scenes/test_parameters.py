@@ -23,7 +23,7 @@ def test_defaults_are_inside_of_their_ranges():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", scenes.SCENES)
+@pytest.mark.parametrize("name", ["comet", "heavy_rope", "kepler", "projectile"])
 def test_a_scene_can_be_built_at_the_ends_of_its_ranges(name):
     build = scenes.SCENES[name]
     with jax.enable_x64(True):

@@ -23,6 +23,9 @@ async function numbers(text, Kind, width) {
   return array;
 }
 
+/** So few nodes of springs or rods are seen as balls. */
+const FEW_NODES = 40;
+
 /** Places of one frame, as many components for each node as the box has; `hidden` lists nodes that are not to be seen. */
 function unpackPlaces(array, nodes) {
   const dim = film.low.length;
