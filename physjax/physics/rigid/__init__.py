@@ -7,7 +7,8 @@
 
 Forces on particles act at the center of mass, and with `AtPoint` at any point. Everything else is a `Load`: `(t,
 bodies, inertia) -> Wrench`. Points of a body are given in its own frame, from its center of mass. `ContactPoints` are
-those that can touch; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what they may not pass, and
+those that can touch surfaces, a `Shape` is what a body fills; `contacts=(SurfaceContact(hull, surface),)` or `(Solids(
+shapes, surfaces),)` say what they may not pass, and
 `Joints` hold bodies together, exactly or as springs; `Hinges`, `Welds`, `Sliders` and `Rods` are exact.
 """
 
@@ -35,10 +36,11 @@ from physjax.physics.rigid.planar import (
     PlanarContacts,
     PlanarInertia,
     PlanarShape,
-    Solids,
     find_planar_contacts,
     planar_bodies,
 )
+from physjax.physics.rigid.solids.contact import Solids
+from physjax.physics.rigid.space.shapes import Shape
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench
 from physjax.physics.rigid.surface_contact import Hull, SurfaceContact, Touch
 
@@ -57,6 +59,7 @@ __all__ = [
     "RigidBodies",
     "Rods",
     "RotationalDrag",
+    "Shape",
     "Sliders",
     "Solids",
     "SurfaceContact",

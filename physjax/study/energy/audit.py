@@ -22,8 +22,8 @@ from physjax.particles import callable_name
 from physjax.parts import Force
 from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.response import collide, fold_body_flights
+from physjax.physics.rigid.solids.response import solve_contacts
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 from physjax.stages import Stage
