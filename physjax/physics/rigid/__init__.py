@@ -8,9 +8,10 @@
 Forces on particles act at the center of mass, and with `AtPoint` at any point. Everything else is a `Load`: `(t,
 bodies, inertia) -> Wrench`. Points of a body are given in its own frame, from its center of mass. `ContactPoints` are
 those that can touch; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what they may not pass, and
-`Joints` hold bodies together, exactly or as springs; `Hinges`, `Welds`, `Sliders` and `Rods` are exact.
+`Joints` hold bodies together, exactly or as springs; `Hinges`, `Welds`, `Sliders`, `Rods` and `Ropes` are exact.
 """
 
+from physjax.physics.rigid.axis_joints import Hinges, Sliders
 from physjax.physics.rigid.body_points import (
     angular_acceleration,
     angular_velocity,
@@ -19,7 +20,7 @@ from physjax.physics.rigid.body_points import (
     point_velocity,
 )
 from physjax.physics.rigid.contact_points import ContactPoints
-from physjax.physics.rigid.joint_kinds import Hinges, Rods, Sliders, Welds
+from physjax.physics.rigid.joint_kinds import Rods, Ropes, Welds
 from physjax.physics.rigid.joints import Joints, hinge
 from physjax.physics.rigid.loads import (
     AtPoint,
@@ -56,6 +57,7 @@ __all__ = [
     "PlanarShape",
     "RigidBodies",
     "Rods",
+    "Ropes",
     "RotationalDrag",
     "Sliders",
     "Solids",

@@ -258,14 +258,6 @@ def test_bad_rods_are_refused_in_plain_words(build, message):
         Scene(Particles(x, jnp.zeros_like(x)), forces=(build(x),))
 
 
-def test_the_ledger_books_no_work_to_rods_and_their_push_on_the_anchor():
-    film = simulate(pendulum([1.0, 0.5], acting=(forces.StokesDrag(0.1),)), methods.verlet, dt=0.01, steps=20)
-    ledger = energy.ledger(film)
-    assert abs(ledger.energy.totals["Rods"]) < 1e-12
-    assert ledger.momentum.closure_error < 1e-12
-    assert np.linalg.norm(ledger.momentum.totals["Rods"]) > 1.0
-
-
 def test_rods_add_no_stiffness_the_limit_is_that_of_the_swing():
     fastest = np.sqrt(G * (2 + np.sqrt(2)))
     limit = stability.limit(pendulum([0.0, 0.0]), methods.verlet)
