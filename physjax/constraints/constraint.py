@@ -45,13 +45,18 @@ class Constraint(Force):
     couples: ClassVar[bool] = True
     pairs: eqx.AbstractVar[Pairs]
     order: int = eqx.field(static=True, default=2, kw_only=True)
-    substeps: int = eqx.field(static=True, default=1, kw_only=True)
+    substeps: int | None = eqx.field(static=True, default=1, kw_only=True)
     breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None, kw_only=True)
     unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None, kw_only=True)
 
-    def set_options(self, order: int, substeps: int, breaks_at: ArrayLike | Sequence | None) -> None:
+    def set_options(self, order: int, substeps: int | None, breaks_at: ArrayLike | Sequence | None) -> None:
         """Check what all kinds of joints are given, for their constructors; nothing has broken yet."""
-        self.order, self.substeps = _demand_order(type(self).__name__, order), as_positive_integer("substeps", substeps)
+        self.order = _demand_order(type(self).__name__, order)
+        self.substeps = None if substeps is None else as_positive_integer("substeps", substeps)
+        if substeps is None and order != 2:
+            raise ValueError(
+                f"{type(self).__name__}: got substeps=None and order={order}, expected order 2 for such steps."
+            )
         self.breaks_at = None if breaks_at is None else as_real_quantity("breaks_at [N]", breaks_at, above=0.0)
         self.unbroken = None
 
@@ -103,6 +108,10 @@ class Constraint(Force):
     @abstractmethod
     def extent(self) -> Array:
         """The size of a joint [m], relative to which it is closed."""
+
+    def find_lengths(self, dtype: np.dtype, worlds: int) -> Float[Array, "joints worlds"]:
+        """The length over which each joint holds, across which it swings [m]."""
+        return jnp.full((len(self.pairs), worlds), self.extent(), dtype)
 
     @property
     def response(self) -> Callable | None:

@@ -124,6 +124,15 @@ class Mechanism(NamedTuple):
         first, second = jnp.split(each, 2, axis=-2)
         return first + second
 
+    def join_rows(self, found: list[Array]) -> Rows:
+        """Numbers of the rows of each part as those of all."""
+        return self._join(found, 0)
+
+    def take_ends(self, table: Array) -> tuple[Array, Array]:
+        """What the bodies at the first end of each joint have, and those at the second; zero for the world."""
+        first, second = jnp.split(self._at_ends(table), 2, axis=-2)
+        return first, second
+
     def change_rates(self, mobility: Array, jacobian: Jacobian, λ: Rows) -> Moves:
         """What impulses of the joints do to velocities: M⁻¹Jᵀλ."""
         return self.coordinates.apply_mobility(mobility, self.sum_at_bodies(jacobian, λ))

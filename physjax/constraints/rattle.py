@@ -23,6 +23,7 @@ from physjax.constraints.impulses import ClosingStep, close_joints
 from physjax.constraints.mechanism import Jacobian, Mechanism, find_constraints, hold_rows
 from physjax.constraints.ranges import Range, Rows, Steps, are_held, change_steps
 from physjax.constraints.reactions import TOUCHING, stop_opening
+from physjax.constraints.swings import resolve_swings
 from physjax.loops import Time, to_float_time
 from physjax.scene import Scene
 
@@ -44,7 +45,9 @@ def hold_joints(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene
         )
     parts = find_constraints(scene)
     dt = jnp.asarray(dt, scene.state.dtype)
-    substeps = max(part.substeps for part in parts)
+    if any(part.substeps is None for part in parts):
+        return resolve_swings(partial(_take_step, motion), scene, t, dt)
+    substeps = max(part.substeps or 1 for part in parts)
     shares = SUZUKI_4 if max(part.order for part in parts) == 4 else (1.0,)
     shares = tuple(share / substeps for share in shares) * substeps
     if len(shares) == 1:

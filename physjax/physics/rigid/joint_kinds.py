@@ -50,7 +50,7 @@ class Welds(BodyJoints):
         points: ArrayLike | Sequence,
         *,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Welds", pairs, points)
@@ -128,7 +128,7 @@ class Rods(BodyDistances):
         length: ArrayLike | Sequence | None = None,
         *,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Rods", pairs, points)
@@ -159,7 +159,7 @@ class Ropes(BodyDistances):
         points: ArrayLike | Sequence,
         length: ArrayLike | Sequence | None = None,
         *,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Ropes", pairs, points)

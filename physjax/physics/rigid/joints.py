@@ -80,7 +80,7 @@ class Joints(BodyJoints):
         axis: ArrayLike | Sequence | None = None,
         cone: ArrayLike | Sequence | None = None,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Joints", pairs, points)

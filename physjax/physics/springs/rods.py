@@ -87,6 +87,11 @@ class Distances(Constraint):
         longest = jnp.max(self.length)
         return longest if self.anchors is None else jnp.maximum(longest, jnp.max(jnp.abs(self.anchors)))
 
+    def find_lengths(self, dtype: np.dtype, worlds: int) -> Float[Array, "joints worlds"]:
+        """Their lengths."""
+        assert self.length is not None
+        return spread_bounds(self.length, (len(self.pairs), worlds)).astype(dtype)
+
     def prepare(self, state: PyTree, mass: PyTree) -> Self:
         """The joints with their lengths, as part of a scene; a ValueError for what they cannot join."""
         reader, name = self.coordinates(state), type(self).__name__
@@ -123,6 +128,9 @@ class Rods(Distances):
     order 2 under every method of order 2 or more; with `order=4` each is five of them, under a symmetric method such as verlet
     of order 4. What moves along a rod at the start is stopped by the first step. `constraint_forces` gives the tensions.
 
+    A link swings across its tension T at up to 2√(T/mL), which a step must resolve, whatever hangs on it: each step is
+    `substeps` steps, and with `substeps=None` as many as it takes, by tension and speed, also where a heavy load whips a rope.
+
     With `breaks_at` [N], one for all or one each, a rod that carries more at the end of a step is gone from then on, in
     tension and in compression; a run records which are `unbroken`.
 
@@ -141,7 +149,7 @@ class Rods(Distances):
         anchors: ArrayLike | Sequence | None = None,
         *,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.set_distances(pairs, length, anchors)
@@ -169,7 +177,7 @@ class Ropes(Distances):
         length: ArrayLike | Sequence | None = None,
         anchors: ArrayLike | Sequence | None = None,
         *,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.set_distances(pairs, length, anchors)
