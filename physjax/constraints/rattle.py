@@ -39,10 +39,6 @@ SUZUKI_4 = (SUZUKI_SHARE, SUZUKI_SHARE, 1 - 4 * SUZUKI_SHARE, SUZUKI_SHARE, SUZU
 
 def hold_joints(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The scene after a step of dt [s] at the end of which all joints are closed and stay so."""
-    if scene.emitter is not None:
-        raise ValueError(
-            "joints: got a scene with an emitter, expected bodies that live from the start: births open joints."
-        )
     parts = find_constraints(scene)
     dt = jnp.asarray(dt, scene.state.dtype)
     if any(part.substeps is None for part in parts):
