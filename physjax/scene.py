@@ -125,6 +125,10 @@ class Scene(eqx.Module):
         self.mass = mass
         forces = [prepare_force(force, dtype) for force in as_tuple("force", forces)]
         self.forces = unify_gravity(forces, state.position.shape[-1])
+        if emitter is not None and self.constraints:
+            raise ValueError(
+                "Scene: got an emitter and joints, expected one of them: joined bodies live from the start. Leave one out."
+            )
         self.contacts = tuple(prepare_contact(contact, dtype) for contact in as_tuple("contact", contacts))
         for part in (*self.forces, *self.contacts):
             demand_fitting_numbers(part, lanes, state.position.shape[-1])

@@ -222,7 +222,7 @@ def test_tab_shows_what_is_ours_and_nothing_else(name):
 def test_vectors_are_written_by_components_and_never_scattered(file):
     slow = {"einsum", "tensordot", "matmul", "vdot", "linalg"}
     # contacts that are solved one after the other, in whole rows of worlds, which are as fast as slices; and some worlds of many
-    writes_rows = file in ("physics/rigid/planar/impulses.py", "physics/rigid/planar/impacts.py")
+    writes_rows = file in ("physics/rigid/solids/sweeps.py", "physics/rigid/solids/impacts.py")
     for node in ast.walk(TREES[file]):
         assert not (isinstance(node, ast.Attribute) and node.attr in slow), f"{file}:{node.lineno} {node.attr}"
         assert not (isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult)), f"{file}:{node.lineno} @"

@@ -21,11 +21,14 @@ from physjax.checks import (
 )
 from physjax.constraints.coordinates import Coordinates, Places
 from physjax.constraints.elimination import Pairs
+from physjax.constraints.ranges import Bounds, Rows
 from physjax.loops import Time
 from physjax.parts import Force
 from physjax.vectors import add_leading_axes
 
 C = TypeVar("C", bound="Constraint")
+PushedRows = Float[Array, "freedoms rows joints worlds"]
+"""How rows change with moves of one end of each joint."""
 ORDERS = (2, 4)
 """Orders of the step that holds joints."""
 
@@ -42,24 +45,57 @@ class Constraint(Force):
     couples: ClassVar[bool] = True
     pairs: eqx.AbstractVar[Pairs]
     order: int = eqx.field(static=True, default=2, kw_only=True)
-    substeps: int = eqx.field(static=True, default=1, kw_only=True)
+    substeps: int | None = eqx.field(static=True, default=1, kw_only=True)
     breaks_at: OptionalNumbers = quantity("breaks_at", "N", per="joint", above=0, default=None, kw_only=True)
     unbroken: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="joint", default=None, kw_only=True)
 
-    def set_options(self, order: int, substeps: int, breaks_at: ArrayLike | Sequence | None) -> None:
+    def set_options(self, order: int, substeps: int | None, breaks_at: ArrayLike | Sequence | None) -> None:
         """Check what all kinds of joints are given, for their constructors; nothing has broken yet."""
-        self.order, self.substeps = _demand_order(type(self).__name__, order), as_positive_integer("substeps", substeps)
+        self.order = _demand_order(type(self).__name__, order)
+        self.substeps = None if substeps is None else as_positive_integer("substeps", substeps)
+        if substeps is None and order != 2:
+            raise ValueError(
+                f"{type(self).__name__}: got substeps=None and order={order}, expected order 2 for such steps."
+            )
         self.breaks_at = None if breaks_at is None else as_real_quantity("breaks_at [N]", breaks_at, above=0.0)
         self.unbroken = None
 
     @property
     @abstractmethod
     def rows(self) -> int:
-        """How many numbers of each joint must be zero."""
+        """How many numbers of each joint must be zero, or within bounds."""
 
     @abstractmethod
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
-        """By how much each joint is off [m], or [rad], given the places of its two ends, `(numbers, joints, worlds)`."""
+        """By how much each joint is off [m], or [rad], given the places of its two ends, `(numbers, joints, worlds)`.
+
+        Of rows with bounds, which come last, it is what they bound.
+        """
+
+    def differentiate(self, reader: Coordinates, first: Places, second: Places) -> tuple[Rows, PushedRows, PushedRows]:
+        """What `measure` returns, and how that changes with moves of the first ends and of the second."""
+        still = jnp.zeros((reader.freedoms, *first.shape[1:]), first.dtype)
+        count = reader.freedoms
+        # both ends at once: `measure` is traced, and compiled, once
+        units = np.eye(2 * count).reshape(2 * count, 2, count, *[1] * (still.ndim - 1))
+        units = jnp.broadcast_to(units.astype(first.dtype), (2 * count, 2, *still.shape))
+        change = lambda moves: self.measure(reader.displace(first, moves[0]), reader.displace(second, moves[1]))  # noqa: E731
+        x, push = jax.linearize(change, jnp.stack([still, still]))
+        rows = jax.vmap(push)(units)
+        return x, rows[:count], rows[count:]
+
+    @property
+    def bounded(self) -> bool:
+        """Whether some rows are not held at zero, but between limits, or driven."""
+        return False
+
+    def find_bounds(self, like: Rows) -> Bounds:
+        """What the rows are held to, shaped like these."""
+        return Bounds.hold(like)
+
+    def unwrap(self, x: Rows, near: Rows) -> Rows:
+        """The rows, with angles that are known up to turns as near to others as they can be."""
+        return x
 
     @abstractmethod
     def coordinates(self, state: PyTree) -> Coordinates:
@@ -72,6 +108,10 @@ class Constraint(Force):
     @abstractmethod
     def extent(self) -> Array:
         """The size of a joint [m], relative to which it is closed."""
+
+    def find_lengths(self, dtype: np.dtype, worlds: int) -> Float[Array, "joints worlds"]:
+        """The length over which each joint holds, across which it swings [m]."""
+        return jnp.full((len(self.pairs), worlds), self.extent(), dtype)
 
     @property
     def response(self) -> Callable | None:
@@ -202,6 +242,8 @@ def demand_closed(part: Constraint, state: PyTree, describe: Callable[[int], str
 @jax.jit
 def _measure_start(part: Constraint, state: PyTree) -> tuple[Array, Array]:
     gap = part.measure(*part.find_ends(part.coordinates(state).read_places(state)))
+    bounds = part.find_bounds(jnp.zeros_like(gap))
+    gap = gap - jnp.clip(gap, bounds.low, bounds.high)
     return gap if part.unbroken is None else gap * spread_unbroken(part, gap.shape[-1], gap.dtype)[None], part.extent()
 
 
@@ -215,6 +257,7 @@ def spread_unbroken(part: Constraint, worlds: int, dtype: np.dtype) -> Float[Arr
 
 __all__ = [
     "Constraint",
+    "PushedRows",
     "check_joint_pairs",
     "demand_closed",
     "remember_breaks",

@@ -3,20 +3,23 @@
 from functools import cache
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from physjax.constraints.block_solve import Blocks, solve_blocks
 from physjax.constraints.constraint import Constraint, spread_unbroken
 from physjax.constraints.coordinates import Coordinates, Moves, Places, put_worlds_last
 from physjax.constraints.elimination import Elimination, Pairs, plan_elimination
+from physjax.constraints.ranges import Bounds, Rows
 
+CLOSED_SHARE = 1e-12
+"""Relative to its size, how far a closed joint may be open."""
+CLOSED_ROUNDINGS = 16
+"""The same in roundings of the number type, where that is more: float32 has no 12 digits."""
 Jacobian = Float[Array, "freedoms rows ends worlds"]
 """How the rows of each joint change with moves of its two ends: first ends of all joints, then second ends."""
-Rows = Float[Array, "rows joints worlds"]
-"""A number for each row of each joint."""
 
 
 class Mechanism(NamedTuple):
@@ -54,28 +57,47 @@ class Mechanism(NamedTuple):
         """The most rows that a joint has."""
         return max(part.rows for part in self.parts)
 
-    def measure(self, places: Places) -> Rows:
-        """By how much each joint is off."""
-        gap = self._join([part.measure(*part.find_ends(places)) for part in self.parts], 0)
-        return gap if self.whole is None else gap * self.whole[None]
+    def measure(self, places: Places, near: Rows | None = None) -> Rows:
+        """The numbers of each joint, of which those that must be zero say how far it is off; angles in the turn of `near`."""
+        return self._finish([part.measure(*part.find_ends(places)) for part in self.parts], near)
 
-    def differentiate(self, places: Places) -> Jacobian:
-        """The Jacobian of `measure`."""
-        found = [self._differentiate_part(part, *part.find_ends(places)) for part in self.parts]
-        ends = [self._join(list(ends), 1) for ends in zip(*found, strict=True)]
+    def _finish(self, found: list[Array], near: Rows | None) -> Rows:
+        """The rows of all parts together; zero of what broke."""
+        x = self._join(found, 0)
+        if near is not None and any(part.bounded for part in self.parts):
+            cuts = np.cumsum([len(part.pairs) for part in self.parts])[:-1]
+            split = zip(self.parts, *(jnp.split(a, cuts, axis=-2) for a in (x, near)), strict=True)
+            x = jnp.concatenate([part.unwrap(own, start) for part, own, start in split], axis=-2)
+        return x if self.whole is None else x * self.whole[None]
+
+    def measure_tolerance(self, places: Places, mobility: Array) -> Float[Array, " worlds"]:
+        """How far joints of bodies in these places may be open [m] to count as closed."""
+        size = jnp.max(jnp.abs(places[: self.coordinates.dim]), axis=(0, 1))
+        size = jnp.maximum(size, jnp.max(self.coordinates.measure_bodies(mobility), axis=0))
+        for part in self.parts:
+            size = jnp.maximum(size, part.extent())
+        share = max(CLOSED_SHARE, CLOSED_ROUNDINGS * float(jnp.finfo(places.dtype).eps))
+        return lax.stop_gradient(share * size)
+
+    def find_bounds(self, like: Rows) -> Bounds | None:
+        """What rows are held to; None where all of them are held at zero."""
+        if not any(part.bounded for part in self.parts):
+            return None
+        worlds = like.shape[-1]
+        found = [part.find_bounds(jnp.zeros((part.rows, len(part.pairs), worlds), like.dtype)) for part in self.parts]
+        bounds = Bounds(*(self._join(list(each), 0) for each in zip(*found, strict=True)))
+        if self.whole is None:
+            return bounds
+        return Bounds(*(jnp.where(self.whole[None] > 0, each, 0.0) for each in bounds))
+
+    def differentiate(self, places: Places, near: Rows | None = None) -> tuple[Jacobian, Rows]:
+        """The Jacobian of `measure`, and what that returns."""
+        parts = [part.differentiate(self.coordinates, *part.find_ends(places)) for part in self.parts]
+        found, firsts, seconds = map(list, zip(*parts, strict=True))
+        ends = [self._join(end, 1) for end in (firsts, seconds)]
         if self.whole is not None:
             ends = [end * self.whole[None, None] for end in ends]
-        return jnp.concatenate(ends, axis=-2)
-
-    def _differentiate_part(self, part: Constraint, first: Places, second: Places) -> tuple[Array, Array]:
-        move, count = self.coordinates.displace, self.coordinates.freedoms
-        still = jnp.zeros((count, *first.shape[1:]), first.dtype)
-        units = jnp.broadcast_to(jnp.eye(count, dtype=first.dtype)[..., None, None], (count, *still.shape))
-        along = lambda function: jax.vmap(lambda unit: jax.jvp(function, (still,), (unit,))[1])(units)  # noqa: E731
-        return (
-            along(lambda moves: part.measure(move(first, moves), second)),
-            along(lambda moves: part.measure(first, move(second, moves))),
-        )
+        return jnp.concatenate(ends, axis=-2), self._finish(found, near)
 
     def _join(self, arrays: list[Array], axis: int) -> Array:
         """Arrays of parts as one of all joints, with as many rows for each."""
@@ -102,9 +124,27 @@ class Mechanism(NamedTuple):
         first, second = jnp.split(each, 2, axis=-2)
         return first + second
 
+    def join_rows(self, found: list[Array]) -> Rows:
+        """Numbers of the rows of each part as those of all."""
+        return self._join(found, 0)
+
+    def take_ends(self, table: Array) -> tuple[Array, Array]:
+        """What the bodies at the first end of each joint have, and those at the second; zero for the world."""
+        first, second = jnp.split(self._at_ends(table), 2, axis=-2)
+        return first, second
+
+    def change_rates(self, mobility: Array, jacobian: Jacobian, λ: Rows) -> Moves:
+        """What impulses of the joints do to velocities: M⁻¹Jᵀλ."""
+        return self.coordinates.apply_mobility(mobility, self.sum_at_bodies(jacobian, λ))
+
     def move_by_impulses(self, mobility: Array, jacobian: Jacobian) -> Jacobian:
         """M⁻¹Jᵀ: the velocities that a unit impulse of each row gives to both ends."""
         return self.coordinates.apply_mobility(self._at_ends(self.free[None] * mobility)[:, None], jacobian)
+
+    def measure_mobilities(self, jacobian: Jacobian, moved: Jacobian) -> Rows:
+        """By how much a unit impulse of each row changes its own rate: the diagonal of J M⁻¹ Jᵀ."""
+        first, second = jnp.split(jnp.sum(jacobian * moved, axis=0), 2, axis=-2)
+        return first + second
 
     def build_matrix(self, jacobian: Jacobian, moved: Jacobian) -> Blocks:
         """J M⁻¹ Jᵀ, from the Jacobian at one place and M⁻¹Jᵀ there or at another; one for rows that a joint lacks or lost."""
@@ -149,6 +189,11 @@ def find_constraints(scene: PyTree) -> tuple[Constraint, ...]:
     return tuple(force for force in scene.forces if force.response is not None)
 
 
+def hold_rows(jacobian: Jacobian, held: Array) -> Jacobian:
+    """The Jacobian with zeros for the rows `(rows, joints, worlds)` that are not held, whose impulse is then found to be zero."""
+    return jacobian * jnp.concatenate([held, held], axis=-2).astype(jacobian.dtype)[None]
+
+
 def _contract(left: Array, right: Array) -> Array:
     """Σ over freedoms of the products of all rows with all rows, `(rows, rows, entries, worlds)`."""
     return jnp.sum(left[:, :, None] * right[:, None], axis=0)
@@ -165,4 +210,4 @@ def _list_ends_of_bodies(pairs: Pairs, bodies: int) -> np.ndarray:
     return table
 
 
-__all__ = ["Jacobian", "Mechanism", "Rows", "find_constraints"]
+__all__ = ["Jacobian", "Mechanism", "find_constraints", "hold_rows"]

@@ -20,17 +20,17 @@ from jaxtyping import Array, Float, PyTree
 from physjax.constraints.constraint import Constraint
 from physjax.constraints.coordinates import Places
 from physjax.constraints.impulses import ClosingStep, close_joints
-from physjax.constraints.mechanism import Jacobian, Mechanism, Rows, find_constraints
-from physjax.constraints.reactions import stop_opening
+from physjax.constraints.mechanism import Jacobian, Mechanism, find_constraints, hold_rows
+from physjax.constraints.ranges import Range, Rows, Steps, are_held, change_steps
+from physjax.constraints.reactions import TOUCHING, stop_opening
+from physjax.constraints.swings import resolve_swings
 from physjax.loops import Time, to_float_time
 from physjax.scene import Scene
 
-CLOSED_SHARE = 1e-12
-"""Relative to its size, how far a closed joint may be open."""
-CLOSED_ROUNDINGS = 16
-"""The same in roundings of the number type, where that is more: float32 has no 12 digits."""
 MAX_CORRECTIONS = 8
 """Newton's steps towards closed joints between two steps of the method; three are taken where joints turn by 0.1 rad."""
+MAX_BOUNDED_CORRECTIONS = 32
+"""The same where limits or motors choose anew in each whether they hold."""
 SUZUKI_SHARE = 1 / (4 - 4 ** (1 / 3))
 """The share of a step [1] for which the errors of order 3 of five steps cancel."""
 SUZUKI_4 = (SUZUKI_SHARE, SUZUKI_SHARE, 1 - 4 * SUZUKI_SHARE, SUZUKI_SHARE, SUZUKI_SHARE)
@@ -39,13 +39,11 @@ SUZUKI_4 = (SUZUKI_SHARE, SUZUKI_SHARE, 1 - 4 * SUZUKI_SHARE, SUZUKI_SHARE, SUZU
 
 def hold_joints(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
     """The scene after a step of dt [s] at the end of which all joints are closed and stay so."""
-    if scene.emitter is not None:
-        raise ValueError(
-            "joints: got a scene with an emitter, expected bodies that live from the start: births open joints."
-        )
     parts = find_constraints(scene)
     dt = jnp.asarray(dt, scene.state.dtype)
-    substeps = max(part.substeps for part in parts)
+    if any(part.substeps is None for part in parts):
+        return resolve_swings(partial(_take_step, motion), scene, t, dt)
+    substeps = max(part.substeps or 1 for part in parts)
     shares = SUZUKI_4 if max(part.order for part in parts) == 4 else (1.0,)
     shares = tuple(share / substeps for share in shares) * substeps
     if len(shares) == 1:
@@ -60,13 +58,23 @@ def hold_joints(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene
 
 
 class _Start(NamedTuple):
-    """What a step begins with: the mechanism, its Jacobian and M⁻¹Jᵀ at the start, and the length of the step of each world."""
+    """What a step begins with: the mechanism, its Jacobian and M⁻¹Jᵀ at the start, and the length of the step of each world.
+
+    `x` are the numbers of its rows, `allowed` what they may be at the end; None where all are held at zero.
+    """
 
     mechanism: Mechanism
     jacobian: Jacobian
     moved: Jacobian
+    mobility: Array
     h: Float[Array, " worlds"]
     tolerance: Float[Array, " worlds"]
+    x: Rows
+    allowed: Range | None
+
+    def measure_gap(self, x: Rows, λ: Rows) -> Rows:
+        """By how much the rows are off, given their impulses."""
+        return x if self.allowed is None else self.allowed.measure_gap(x, λ)
 
 
 def _take_step(motion: Callable, scene: Scene, t: Time, dt: Array) -> Scene:
@@ -79,34 +87,35 @@ def _take_step(motion: Callable, scene: Scene, t: Time, dt: Array) -> Scene:
     read = mechanism.coordinates.read_places
     push = lambda λ: _push(start, scene, λ)  # noqa: E731
 
-    def take(λ: Rows) -> tuple[Rows, PyTree]:
+    def take(λ: Rows) -> tuple[Rows, tuple[PyTree, Rows]]:
         end = motion(free.replace(state=push(λ)), t, dt).state
         if scene.prescribed_motion is not None:
             end = scene.prescribed_motion.prescribe(to_float_time(t + dt), end)
-        return mechanism.measure(read(end)), end
+        x = mechanism.measure(read(end), start.x)
+        return start.measure_gap(x, λ), (end, x)
 
     drift = lambda λ: read(push(λ).drift(dt, mass))  # noqa: E731
     step = ClosingStep(take, partial(_correct, start, drift), partial(_invert, start), start.tolerance)
     none = jnp.zeros((mechanism.rows, len(mechanism.pairs), len(start.h)), start.h.dtype)
-    _, gap, end = close_joints(step, none)
+    _, gap, (end, _) = close_joints(step, none)
     good = jnp.all(jnp.max(jnp.abs(gap), axis=(0, 1)) <= start.tolerance * float(jnp.finfo(gap.dtype).eps) ** -0.25)
     end = jax.tree.map(lambda leaf: leaf * jnp.where(good, 1.0, jnp.nan).astype(leaf.dtype), end)
-    return scene.replace(state=stop_opening(mechanism, scene, end))
+    return scene.replace(state=stop_opening(mechanism, scene, end, TOUCHING * start.tolerance, start.h))
 
 
 def _begin(scene: Scene, dt: Array) -> _Start:
     mechanism = Mechanism.of(scene)
     state, worlds = scene.state, mechanism.free.shape[-1]
     places = mechanism.coordinates.read_places(state)
-    jacobian = mechanism.differentiate(places)
+    jacobian, x = mechanism.differentiate(places)
     mobility = mechanism.coordinates.read_mobility(state, scene.mass)
     moved = mechanism.move_by_impulses(mobility, jacobian)
-    share = max(CLOSED_SHARE, CLOSED_ROUNDINGS * float(jnp.finfo(state.dtype).eps))
-    size = jnp.max(jnp.abs(places[: mechanism.coordinates.dim]), axis=(0, 1))
-    size = jnp.maximum(size, jnp.max(mechanism.coordinates.measure_bodies(mobility), axis=0))
-    for part in mechanism.parts:
-        size = jnp.maximum(size, part.extent())
-    return _Start(mechanism, jacobian, moved, jnp.broadcast_to(dt.reshape(-1), worlds), lax.stop_gradient(share * size))
+    h = jnp.broadcast_to(dt.reshape(-1), worlds)
+    bounds, allowed = mechanism.find_bounds(x), None
+    if bounds is not None:
+        scale = lax.stop_gradient(h[None, None] * mechanism.measure_mobilities(jacobian, moved))
+        allowed = bounds.after(x, h)._replace(scale=scale)
+    return _Start(mechanism, jacobian, moved, mobility, h, mechanism.measure_tolerance(places, mobility), x, allowed)
 
 
 def _push(start: _Start, scene: Scene, λ: Rows) -> PyTree:
@@ -115,40 +124,63 @@ def _push(start: _Start, scene: Scene, λ: Rows) -> PyTree:
     return mechanism.coordinates.push(scene.state, scene.mass, mechanism.sum_at_bodies(start.jacobian, λ))
 
 
-def _correct(start: _Start, drift: Callable[[Rows], Places], λ: Rows, end: PyTree) -> Rows:
+def _correct(start: _Start, drift: Callable[[Rows], Places], λ: Rows, taken: tuple[PyTree, Rows]) -> Rows:
     """Better impulses, by Newton's method: other impulses lead to where a drift with them leads from there.
 
     That is exact where forces do not see the velocity and a step evaluates them at its start, or half way.
     """
-    mechanism, coordinates = start.mechanism, start.mechanism.coordinates
-    there, before = coordinates.read_places(end), drift(λ)
-    predict = lambda λ: coordinates.carry_on(there, before, drift(λ))  # noqa: E731
-    worst = lambda gap: jnp.max(jnp.abs(gap), axis=(0, 1))  # noqa: E731
+    mechanism, allowed = start.mechanism, start.allowed
+    end, x = taken
+    there, before = mechanism.coordinates.read_places(end), drift(λ)
+    worst = lambda x, λ: jnp.max(jnp.abs(start.measure_gap(x, λ)), axis=(0, 1))  # noqa: E731
 
     def turn(carry: tuple) -> tuple:
-        λ, places, gap, count = carry
-        change = (
-            mechanism.solve(mechanism.build_matrix(mechanism.differentiate(places), start.moved), gap)
-            / start.h[None, None]
-        )
+        λ, places, x, steps, count = carry
+        if allowed is not None:
+            steps = change_steps(steps, allowed.find_steps(x, λ), count)
         # worlds whose joints are closed keep their impulses
-        λ = jnp.where((worst(gap) > start.tolerance)[None, None], λ - change, λ)
-        places = predict(λ)
-        return λ, places, mechanism.measure(places), count + 1
+        λ = jnp.where((worst(x, λ) > start.tolerance)[None, None], _take_newton_step(start, λ, places, steps), λ)
+        places = mechanism.coordinates.carry_on(there, before, drift(λ))
+        return λ, places, mechanism.measure(places, start.x), steps, count + 1
 
     def goes_on(carry: tuple) -> Array:
-        _, _, gap, count = carry
-        return jnp.any(worst(gap) > start.tolerance) & (count < MAX_CORRECTIONS)
+        λ, _, x, _, count = carry
+        return jnp.any(worst(x, λ) > start.tolerance) & (count < most)
 
-    return lax.while_loop(goes_on, turn, (λ, there, mechanism.measure(there), jnp.zeros((), jnp.int32)))[0]
+    most = MAX_CORRECTIONS if allowed is None else MAX_BOUNDED_CORRECTIONS
+    steps = None if allowed is None else allowed.find_steps(x, λ)
+    return lax.while_loop(goes_on, turn, (λ, there, x, steps, jnp.zeros((), jnp.int32)))[0]
 
 
-def _invert(start: _Start, λ: Rows, end: PyTree, gap: Rows, transposed: bool) -> Rows:
+def _take_newton_step(start: _Start, λ: Rows, places: Places, steps: Steps | None) -> Rows:
+    """The impulses after which joints are closed, as far as they move bodies in proportion."""
+    mechanism, allowed, moved = start.mechanism, start.allowed, start.moved
+    there, gap = mechanism.differentiate(places, start.x)
+    if allowed is not None and steps is not None:
+        held = are_held(steps)
+        driven = jnp.where(held, λ, allowed.find_impulse(steps))
+        # what driven rows change is known, and held ones answer it
+        rates = mechanism.change_rates(start.mobility, start.jacobian, driven - λ)
+        gap = gap + start.h[None, None] * mechanism.measure_rates(there, rates)
+        gap = jnp.where(held, gap - allowed.find_target(steps), 0.0)
+        there, moved, λ = hold_rows(there, held), hold_rows(moved, held), driven
+    return λ - mechanism.solve(mechanism.build_matrix(there, moved), gap) / start.h[None, None]
+
+
+def _invert(start: _Start, λ: Rows, taken: tuple[PyTree, Rows], gap: Rows, transposed: bool) -> Rows:
     """The change of impulses that closes small gaps at the end of a step, or the transposed of that."""
-    mechanism = start.mechanism
-    there = mechanism.differentiate(mechanism.coordinates.read_places(end))
-    matrix = mechanism.build_matrix(there, start.moved)
-    return mechanism.solve(matrix.transposed() if transposed else matrix, gap) / start.h[None, None]
+    mechanism, allowed = start.mechanism, start.allowed
+    end, x = taken
+    there, _ = mechanism.differentiate(mechanism.coordinates.read_places(end))
+    moved, held = start.moved, None if allowed is None else are_held(allowed.find_steps(x, λ))
+    if held is not None:
+        there, moved = hold_rows(there, held), hold_rows(moved, held)
+    matrix = mechanism.build_matrix(there, moved)
+    found = mechanism.solve(matrix.transposed() if transposed else matrix, gap) / start.h[None, None]
+    if allowed is None or held is None:
+        return found
+    # what rows that are not held do to others is left to the iteration that this serves
+    return jnp.where(held, found, gap / jnp.where(allowed.scale > 0, allowed.scale, 1.0))
 
 
 __all__ = ["hold_joints"]

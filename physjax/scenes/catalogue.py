@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from physjax.physics.rigid.planar import PlanarBodies
 from physjax.physics.rigid.spatial import RigidBodies
-from physjax.physics.springs.rods import Rods
+from physjax.physics.springs.rods import Rods, Ropes
 from physjax.physics.springs.springs import Springs
 from physjax.scenes.registry import SCENES, title
 from physjax.study.problem import Problem
@@ -136,7 +136,7 @@ def _describe_size(problem: Problem) -> str:
     lanes = state.position[..., 0].size
     one, many = ("body", "bodies") if isinstance(state, RigidBodies | PlanarBodies) else ("particle", "particles")
     words, joined = f"{lanes} {one if lanes == 1 else many}", ""
-    for kind, word in ((Springs, "spring"), (Rods, "rod")):
+    for kind, word in ((Springs, "spring"), (Rods, "rod"), (Ropes, "rope")):
         number = sum(len(force.pairs) for force in forces if isinstance(force, kind))
         joined += f", {number} {word}{'s' * (number > 1)}" if number else ""
     return f"{words} in {state.position.shape[-1]}-D{joined}, {format_seconds(problem.duration)}"

@@ -61,7 +61,7 @@ def heavy_rope(links: int = 20, ratio: float = 1800.0, length: float = 2.0, g: f
     swung = Scene(
         Particles(start, jnp.zeros_like(start)),
         mass,
-        (forces.Gravity(g), Rods(pairs, length / links, substeps=8)),
+        (forces.Gravity(g), Rods(pairs, length / links, substeps=None)),
         pinned=np.arange(links + 1) == 0,
     )
     reach = lambda f: np.linalg.norm(f.position[:, -1], axis=-1)  # noqa: E731

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 
 from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.physics.springs.assembly import Lattice
-from physjax.physics.springs.rods import Rods
+from physjax.physics.springs.rods import Distances
 from physjax.physics.springs.springs import Springs
 from physjax.show.films import Film, schedule
 from physjax.show.frames import get_faces, take_frames, take_lanes
@@ -84,7 +84,7 @@ def bodies(
 
 def springs(
     film: Trajectory,
-    sheet: Lattice | Springs | Rods,
+    sheet: Lattice | Springs | Distances | tuple[Springs | Distances, ...],
     *,
     scene: int | Sequence[int] | None = None,
     limit: int | float | None = None,

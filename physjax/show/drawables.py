@@ -8,10 +8,10 @@ import numpy as np
 from physjax.physics.rigid.planar import PlanarBodies, PlanarShape
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.physics.springs.assembly import Lattice
-from physjax.physics.springs.rods import Rods
+from physjax.physics.springs.rods import Distances
 from physjax.physics.springs.springs import Springs
 from physjax.show.frames import Frames, get_faces, take_frames, take_lanes
-from physjax.show.lines import Lines, take_lines
+from physjax.show.lines import Lines, are_lines, take_lines
 from physjax.show.planar import build_planar_outline, check_planar_bodies, find_planar_shapes, list_shapes
 from physjax.show.solids import BodyShapes, Shape, build_inertia_boxes, check_shapes, place_shapes
 from physjax.trajectory import Trajectory
@@ -58,7 +58,7 @@ class Dots(NamedTuple):
 
 
 Drawable = Surface | Lines | Bodies | PlanarFigures | Dots
-Look = Lattice | Springs | Rods | BodyShapes
+Look = Lattice | Springs | Distances | tuple[Springs | Distances, ...] | BodyShapes
 """What a user may say that a run is drawn as."""
 
 
@@ -72,13 +72,17 @@ def choose_drawable(
     """What a film is drawn as by `shown`: a lattice with faces, springs, rods, a lattice, a `Shape` or one for each body.
 
     Without it bodies are boxes of their own inertia, in the plane the shapes of the scene's `Solids`; nodes are joined by
-    the springs or the rods of the scene, and all else is dots. Of a batch of scenes `scene` picks one. Raises TypeError or
+    all springs, rods and ropes of the scene, and all else is dots. Of a batch of scenes `scene` picks one. Raises TypeError or
     ValueError for what does not fit.
     """
     if shown is None and isinstance(film, Trajectory) and film.scene is not None and film.state is not None:
         shown = find_default_look(film)
     # a lattice is a tuple as well
-    given = isinstance(shown, Shape | PlanarShape | list | tuple) and not isinstance(shown, Lattice)
+    given = (
+        isinstance(shown, Shape | PlanarShape | list | tuple)
+        and not isinstance(shown, Lattice)
+        and not are_lines(shown)
+    )
     bodies = cast("BodyShapes | None", shown) if given else None
     if scene is not None and (shown is None or bodies is not None):
         raise ValueError(
@@ -100,7 +104,7 @@ def choose_drawable(
 
 
 def find_default_look(film: Trajectory) -> Look | None:
-    """What the scene of a film is drawn as: boxes for bodies, in the plane shapes, springs or rods not on a line, or None."""
+    """What the scene of a film is drawn as: boxes for bodies, in the plane shapes, all its lines not on a line, or None."""
     scene = film.scene
     if scene is None:
         return None
@@ -110,7 +114,8 @@ def find_default_look(film: Trajectory) -> Look | None:
         return find_planar_shapes(film)
     if film.position.shape[-1] == 1:
         return None
-    return next((force for kind in (Springs, Rods) for force in scene.forces if isinstance(force, kind)), None)
+    lines = tuple(force for force in scene.forces if isinstance(force, Springs | Distances))
+    return lines if len(lines) > 1 else next(iter(lines), None)
 
 
 def _build_sheet(shape: PlanarShape) -> Shape:

@@ -1,12 +1,12 @@
-"""What is drawn as lines: the springs or the rods of a scene, the nodes that they join, and which are intact at each frame."""
+"""What is drawn as lines: the springs, rods and ropes of a scene, the nodes that they join, and which are intact when."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from physjax.physics.springs.assembly import Lattice
-from physjax.physics.springs.rods import Rods
+from physjax.physics.springs.rods import Distances
 from physjax.physics.springs.springs import Springs
 from physjax.show.frames import Frames, find_batch_index, take_frames
 from physjax.trajectory import Trajectory
@@ -32,8 +32,11 @@ def take_lines(
     scene: int | Sequence[int] | None = None,
     dims: tuple[int, ...] = (2, 3),
 ) -> Lines:
-    """The lines of a lattice, of springs or of rods, in one scene of a run; a TypeError for anything else."""
-    if isinstance(shown, Rods):
+    """The lines of a lattice, of springs, rods or ropes, or of several of them, in one scene of a run; else a TypeError."""
+    if are_lines(shown):
+        parts = cast("tuple", shown)
+        return _join_lines([take_lines(who, film, part, scene, dims) for part in parts], parts)
+    if isinstance(shown, Distances):
         return _take_rods(who, film, shown, scene, dims)
     springs = shown.springs if isinstance(shown, Lattice) else shown
     if not isinstance(springs, Springs):
@@ -47,8 +50,49 @@ def take_lines(
     return Lines(run, springs.pairs, rest, _find_unbroken(who, film, springs, index))
 
 
+def are_lines(shown: object) -> bool:
+    """Whether something is several parts of a scene that are drawn as lines."""
+    if not isinstance(shown, tuple) or isinstance(shown, Lattice):
+        return False
+    return len(shown) > 0 and all(isinstance(part, Springs | Distances) for part in shown)
+
+
+def _join_lines(several: list[Lines], parts: tuple) -> Lines:
+    """The lines of several parts as one; rods among springs are as long as at rest, without a strain."""
+    nodes = min(lines.run.position.shape[1] - _count_anchors(part) for lines, part in zip(several, parts, strict=True))
+    places, pairs, begun = [several[0].run.position[:, :nodes]], [], nodes
+    for lines, part in zip(several, parts, strict=True):
+        pairs.append(np.where(lines.pairs >= nodes, lines.pairs - nodes + begun, lines.pairs))
+        if _count_anchors(part):
+            places.append(lines.run.position[:, nodes:])
+            begun += _count_anchors(part)
+    run = several[0].run._replace(position=np.concatenate(places, axis=1))
+    rest, held = None, None
+    if any(lines.rest is not None for lines in several):
+        rest = np.concatenate([_find_rest(*both) for both in zip(several, parts, strict=True)])
+    if any(lines.held is not None for lines in several):
+        whole = [
+            np.ones((len(run.time), len(lines.pairs)), bool) if lines.held is None else lines.held for lines in several
+        ]
+        held = np.concatenate(whole, axis=1)
+    return Lines(run, np.concatenate(pairs), rest, held)
+
+
+def _count_anchors(part: object) -> int:
+    """How many places in the world a part has, which are nodes behind the others."""
+    return len(part.anchors) if isinstance(part, Distances) and part.anchors is not None else 0
+
+
+def _find_rest(lines: Lines, part: object) -> np.ndarray:
+    """The lengths of lines without a strain."""
+    if lines.rest is not None or not isinstance(part, Distances):
+        return np.asarray(lines.rest)
+    length = np.asarray(part.length)
+    return np.broadcast_to(length.reshape(-1, *length.shape[-1:])[0] if length.ndim else length, len(lines.pairs))
+
+
 def _take_rods(
-    who: str, film: Trajectory, rods: Rods, scene: int | Sequence[int] | None, dims: tuple[int, ...]
+    who: str, film: Trajectory, rods: Distances, scene: int | Sequence[int] | None, dims: tuple[int, ...]
 ) -> Lines:
     """Rods between particles, and to anchors, which are nodes that rest behind the others."""
     run = take_frames(who, film, scene=scene, dims=dims)
@@ -62,7 +106,7 @@ def _take_rods(
     return Lines(run, np.where(pairs < 0, nodes - 1 - pairs, pairs), None, held)
 
 
-def _find_unbroken(who: str, film: Trajectory, lines: Springs | Rods, index: tuple[int, ...]) -> np.ndarray | None:
+def _find_unbroken(who: str, film: Trajectory, lines: Springs | Distances, index: tuple[int, ...]) -> np.ndarray | None:
     """Which lines are intact at every frame, `(frames, lines)`, as the run recorded; None where none can break."""
     if lines.breaks_at is None:
         return None
@@ -82,4 +126,4 @@ def _select_scene(numbers: np.ndarray, index: tuple[int, ...]) -> np.ndarray:
     return numbers[tuple(i if n > 1 else 0 for i, n in zip(index[len(index) - axes :], numbers.shape, strict=False))]
 
 
-__all__ = ["Lines", "take_lines"]
+__all__ = ["Lines", "are_lines", "take_lines"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from physjax.parts import Contact
-from physjax.physics.rigid.planar import Solids
+from physjax.physics.rigid.solids.contact import Solids
 from physjax.physics.rigid.surface_contact import SurfaceContact
 from physjax.show import level_sets, outlines
 from physjax.show.outlines import Outline

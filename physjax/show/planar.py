@@ -8,7 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.physics.rigid.body_joints import BodyJoints
-from physjax.physics.rigid.planar import PlanarBodies, PlanarShape, Solids
+from physjax.physics.rigid.planar import PlanarBodies, PlanarShape
+from physjax.physics.rigid.solids.contact import Solids
 from physjax.show.frames import Frames, take_lanes
 from physjax.show.panels import Scenery
 from physjax.show.stage import build_stage

@@ -8,7 +8,8 @@ import jax
 import numpy as np
 from jax import lax
 
-from physjax.physics.rigid.planar import Solids, find_planar_contacts
+from physjax.physics.rigid.planar import find_planar_contacts
+from physjax.physics.rigid.solids.contact import Solids
 from physjax.show.frames import Frames
 from physjax.show.panels import Scenery
 from physjax.show.stage import build_stage

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from physjax.physics.springs.assembly import Lattice
-from physjax.physics.springs.rods import Rods
+from physjax.physics.springs.rods import Distances
 from physjax.physics.springs.springs import Springs
 from physjax.show.frames import pick_frames
 from physjax.show.lines import Lines, take_lines
@@ -62,7 +62,7 @@ class SpringLines(NamedTuple):
 
 def springs(
     film: Trajectory,
-    sheet: Lattice | Springs | Rods,
+    sheet: Lattice | Springs | Distances | tuple[Springs | Distances, ...],
     frames: int | Iterable[int] | None = None,
     *,
     scene: int | Sequence[int] | None = None,

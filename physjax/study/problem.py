@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from physjax.compiling import announce_compiling
+from physjax.constraints.constraint import Constraint
 from physjax.scene import Scene
 from physjax.stepping import methods
 from physjax.stepping.reference import cast_floats, reference
@@ -66,8 +67,9 @@ class Problem(NamedTuple):
 
     @property
     def is_ode(self) -> bool:
-        """Whether the scene is an ordinary differential equation: no contacts, no emitter, and no force that remembers."""
-        return not self.scene.contacts and self.scene.emitter is None and not self.scene.remembers
+        """Whether the scene is an ordinary differential equation: no contacts, emitter, limits, nor force that remembers."""
+        smooth = not any(isinstance(part, Constraint) and part.bounded for part in self.scene.forces)
+        return smooth and not self.scene.contacts and self.scene.emitter is None and not self.scene.remembers
 
     def reference(self) -> Trajectory:
         """The most accurate run of the scene at `times`, in float64: NumPy arrays.

@@ -11,9 +11,7 @@ from physjax.constraints.elimination import plan_elimination
 MECHANISMS = {
     "one": [(-1, 0)],
     "two": [(-1, 0), (0, 1)],
-    "bridge": [(i - 1, i) for i in range(30)] + [(29, -2)],
     "tree": [((i - 1) // 2, i) for i in range(1, 40)],
-    "star": [(0, i) for i in range(1, 7)],
     "ring": [(i, (i + 1) % 12) for i in range(12)],
     "loops": [(i, i + 1) for i in range(10)] + [(0, 5), (3, 9)],
 }
@@ -41,9 +39,7 @@ def build(pairs, rows, worlds=2):
     return dense, blocks
 
 
-@pytest.mark.parametrize(
-    ("name", "rows"), [("one", 1), ("two", 2), ("bridge", 2), ("tree", 1), ("star", 1), ("ring", 2), ("loops", 1)]
-)
+@pytest.mark.parametrize(("name", "rows"), [("one", 1), ("two", 2), ("tree", 1), ("ring", 2), ("loops", 1)])
 def test_the_solution_is_that_of_the_dense_matrix(name, rows):
     pairs = MECHANISMS[name]
     dense, blocks = build(pairs, rows)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, forces, inertia, methods, rigid, simulate, springs
+from physjax import Particles, Scene, emitters, forces, inertia, methods, rigid, simulate, springs
 from physjax.show.lines import take_lines
 
 G = 9.8
@@ -76,6 +76,13 @@ def test_a_weld_breaks_by_its_force_and_not_by_its_torque():
     np.testing.assert_array_equal(film.parts[0].unbroken[-1], [[True], [False]])
     np.testing.assert_allclose(film.position[-1, 0], [[2.0, 0.0]], atol=1e-11)
     np.testing.assert_allclose(film.position[-1, 1], [[2.0, -0.5 * G * 0.19**2]], atol=1e-11)
+
+
+@pytest.mark.usefixtures("unannotated")
+def test_a_scene_with_joints_and_births_is_refused_while_it_is_built():
+    source = emitters.Emitter(2, emitters.Point((0.0, 0.0)), key=0, life=1.0)
+    with pytest.raises(ValueError, match="got an emitter and joints"):
+        Scene(source.unborn(), forces=(springs.Rods([(0, 1)], 1.0),), emitter=source)
 
 
 @pytest.mark.usefixtures("unannotated")

@@ -14,6 +14,9 @@ SLOW = (
     "ragdoll",
     "heavy_rope",
     "chain_bridge",
+    "crane",
+    "hung_ragdoll",
+    "motor_car",
     "triple_pendulum",
     "tumbling_box",
     "rolling",
@@ -24,7 +27,7 @@ SLOW = (
     "stiff_jelly",
 )
 PILES = ("box_on_slope", "stack_of_ten", "stack_of_sizes", "pyramid", "card_house")
-SOLIDS = (*PILES, "newtons_cradle", "billiard_break", "dominoes", "marble_run", "see_saw")
+SOLIDS = (*PILES, "wrecking_ball", "newtons_cradle", "billiard_break", "dominoes", "marble_run", "see_saw")
 """What compiles for many seconds."""
 
 

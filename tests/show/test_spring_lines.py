@@ -22,6 +22,7 @@ from physjax import (
 )
 from physjax.show import auto_plot
 from physjax.show.drawables import choose_drawable, find_default_look
+from physjax.show.lines import take_lines
 from physjax.show.spring_lines import SpringLines
 
 
@@ -141,6 +142,22 @@ def test_springs_on_a_line_are_refused():
     film = simulate(scene, methods.euler, dt=1e-3, steps=1)
     with pytest.raises(ValueError, match="got positions with 1 component, expected 2 or 3"):
         plot.springs(film, tie)
+
+
+def test_all_parts_of_a_scene_that_are_lines_are_drawn():
+    x = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
+    parts = (
+        springs.Rods([(-1, 0)], anchors=[(0.0, 0.0)]),
+        springs.Springs([(0, 1)], 10.0, 0.8, nodes=3),
+        springs.Ropes([(1, 2), (-2, 2)], [1.5, 2.0], anchors=[(9.0, 9.0), (3.0, 1.0)], breaks_at=1e9),
+    )
+    film = simulate(Scene(Particles(x, np.zeros((3, 2))), forces=parts), methods.verlet, dt=0.01, steps=1)
+    lines = take_lines("a test", film, find_default_look(film))
+    np.testing.assert_array_equal(lines.run.position[0], [*x, [0.0, 0.0], [9.0, 9.0], [3.0, 1.0]])
+    np.testing.assert_array_equal(lines.pairs, [[3, 0], [0, 1], [1, 2], [5, 2]])
+    np.testing.assert_allclose(lines.rest, [1.0, 0.8, 1.5, 2.0])
+    assert lines.held.shape == (2, 4)
+    assert lines.held.all()
 
 
 def test_rods_are_lines_without_a_strain_by_default_and_reach_their_anchors():

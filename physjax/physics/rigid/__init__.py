@@ -7,10 +7,12 @@
 
 Forces on particles act at the center of mass, and with `AtPoint` at any point. Everything else is a `Load`: `(t,
 bodies, inertia) -> Wrench`. Points of a body are given in its own frame, from its center of mass. `ContactPoints` are
-those that can touch; `contacts=(SurfaceContact(hull, surface), Balls(radius))` say what they may not pass, and
-`Joints` hold bodies together, exactly or as springs; `Hinges`, `Welds`, `Sliders` and `Rods` are exact.
+those that can touch surfaces, a `Shape` is what a body fills: `contacts=(Solids(shapes, surfaces),)` keeps bodies out of
+each other, `(SurfaceContact(hull, surface),)` out of surfaces alone. `Joints` hold bodies together, exactly or as springs;
+`Hinges`, `Welds`, `Sliders`, `Rods` and `Ropes` are exact.
 """
 
+from physjax.physics.rigid.axis_joints import Hinges, Sliders
 from physjax.physics.rigid.body_points import (
     angular_acceleration,
     angular_velocity,
@@ -19,7 +21,7 @@ from physjax.physics.rigid.body_points import (
     point_velocity,
 )
 from physjax.physics.rigid.contact_points import ContactPoints
-from physjax.physics.rigid.joint_kinds import Hinges, Rods, Sliders, Welds
+from physjax.physics.rigid.joint_kinds import Rods, Ropes, Welds
 from physjax.physics.rigid.joints import Joints, hinge
 from physjax.physics.rigid.loads import (
     AtPoint,
@@ -35,10 +37,11 @@ from physjax.physics.rigid.planar import (
     PlanarContacts,
     PlanarInertia,
     PlanarShape,
-    Solids,
     find_planar_contacts,
     planar_bodies,
 )
+from physjax.physics.rigid.solids.contact import Solids
+from physjax.physics.rigid.space.shapes import Shape
 from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench
 from physjax.physics.rigid.surface_contact import Hull, SurfaceContact, Touch
 
@@ -56,7 +59,9 @@ __all__ = [
     "PlanarShape",
     "RigidBodies",
     "Rods",
+    "Ropes",
     "RotationalDrag",
+    "Shape",
     "Sliders",
     "Solids",
     "SurfaceContact",

@@ -4,14 +4,13 @@ from collections.abc import Sequence
 from typing import Self
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.checks import as_real_quantity
-from physjax.constraints.constraint import Constraint, check_joint_pairs, demand_closed, remember_breaks
+from physjax.checks import as_real_quantity, demand_direction
+from physjax.constraints.constraint import Constraint, PushedRows, check_joint_pairs, demand_closed, remember_breaks
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
 from physjax.loops import Time
@@ -76,6 +75,39 @@ class BodyJoints(Constraint, Load):
         return joints
 
 
+def differentiate_rows(
+    ends: Ends, places: tuple[Places, Places], angles: Sequence[tuple[Sequence[Array], Sequence[Array]]]
+) -> tuple[PushedRows, PushedRows]:
+    """How rows of joints in space change with moves of the first bodies and of the second: the way from the first point to the
+    second in three rows, then angles, each given by the vectors along which its row changes with turns of either body.
+
+    A point r from the centre moves by d + ω × r. Sums of few arrays, since a compiler computes parts of a stack anew.
+    """
+    rows, both = 3 + len(angles), []
+    for side, sign in enumerate((-1.0, 1.0)):
+        arm = [p - c for p, c in zip(ends[side], places[side][:3], strict=True)]
+        moves = np.zeros((6, rows))
+        moves[:3, :3] = sign * np.eye(3)
+        total = jnp.broadcast_to(moves[..., None, None].astype(arm[0].dtype), (6, rows, *arm[0].shape))
+        for k in range(3):
+            turns = np.zeros((6, rows))
+            # ω × r: the change of row i with the turn about j, for each component k of r
+            turns[3 + (k + 2) % 3, (k + 1) % 3], turns[3 + (k + 1) % 3, (k + 2) % 3] = sign, -sign
+            total = total + turns[..., None, None].astype(arm[0].dtype) * arm[k][None, None]
+            for row, vectors in enumerate(angles):
+                about = np.zeros((6, rows))
+                about[3 + k, 3 + row] = 1.0
+                total = total + about[..., None, None].astype(arm[0].dtype) * vectors[side][k][None, None]
+        both.append(total)
+    return both[0], both[1]
+
+
+def differentiate_cosine(a: Sequence[Array], b: Sequence[Array]) -> tuple[list[Array], list[Array]]:
+    """The vectors along which a·b of a direction of the first body and one of the second changes with their turns."""
+    across = [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
+    return across, [-c for c in across]
+
+
 def check_joints(
     name: str, pairs: ArrayLike | Sequence, points: ArrayLike | Sequence
 ) -> tuple[Pairs, Float[Array, "joints 2 dim"]]:
@@ -90,13 +122,20 @@ def check_joints(
     return joined, found
 
 
-@jax.jit
-def measure_turns(part: BodyJoints, state: PyTree) -> Array:
-    """How the second body of each joint is turned relative to the first: `(*scenes, joints)`, in space quaternions."""
-    reader = part.coordinates(state)
-    turns = reader.compare(*part.find_ends(reader.read_places(state)))
-    turns = jnp.moveaxis(turns, (0, 1, 2), (2, 1, 0)).reshape(*state.lanes[:-1], len(part.pairs), len(turns))
-    return turns[..., 0] if turns.shape[-1] == 1 else turns
+def check_axis(name: str, axis: ArrayLike | Sequence, shapes: Sequence[tuple[int, ...]]) -> Array:
+    """Directions of one of these shapes; a ValueError for others, and for a vector that has none."""
+    found = as_real_quantity("axis [1]", axis)
+    if found.shape not in shapes:
+        expected = " or ".join(str(shape) for shape in shapes)
+        raise ValueError(f"{name}: got an axis of shape {found.shape}, expected {expected}.")
+    demand_direction("axis", found)
+    return found
+
+
+def as_axes(name: str, axis: ArrayLike | Sequence, joints: int) -> Float[Array, "joints 2 3"]:
+    """Directions in space for both bodies of each joint."""
+    found = check_axis(name, axis, ((3,), (joints, 3), (joints, 2, 3)))
+    return jnp.broadcast_to(found if found.ndim == 3 else found[..., None, :], (joints, 2, 3))
 
 
 def put_joints_last(number: Array, components: int) -> Array:
@@ -128,9 +167,12 @@ def read_bodies(bodies: RigidBodies | PlanarBodies) -> Places:
 __all__ = [
     "BodyJoints",
     "Ends",
+    "as_axes",
+    "check_axis",
     "check_joints",
+    "differentiate_cosine",
+    "differentiate_rows",
     "dot_components",
-    "measure_turns",
     "put_joints_last",
     "read_bodies",
     "subtract_points",

@@ -11,6 +11,9 @@ from physjax.physics.rigid.planar_inertia import PlanarInertia
 from physjax.physics.rigid.spatial import RigidBodies, angular_velocity
 from physjax.vectors import conjugate_quaternion, multiply_quaternions, rotate_components, scale
 
+OPPOSITE_COSINE = -1 + 1e-6
+"""The cosine of the angle [1] from which on two vectors count as opposite."""
+
 
 class PlanarCoordinates:
     """Bodies in the plane: x, y [m] and the angle [rad]."""
@@ -161,14 +164,31 @@ class SpatialCoordinates:
         twice = jnp.where(w < 0, -2.0, 2.0)
         return [twice * part for part in u]
 
+    def measure_twist(self, turn: Array, first: Array, second: Array) -> Array:
+        """By which angle a turn is about an axis [rad], from -π to π, given as a vector `(3, joints, 1)` in both frames.
+
+        It is zero where the shortest turn leads one frame to the other that leads one vector to the other.
+        """
+        a, b = _normalise(first), _normalise(second)
+        cosine, sine = _dot(a, b), list(_cross(b, a))
+        # opposite vectors have many shortest turns, of which one about any direction across them is taken
+        across = self.find_normals(first)[0]
+        opposite = cosine < OPPOSITE_COSINE
+        shortest = [
+            jnp.where(opposite, 0.0, 1.0 + cosine),
+            *(jnp.where(opposite, n, s) for n, s in zip(across, sine, strict=True)),
+        ]
+        w, *u = multiply_quaternions(list(turn), conjugate_quaternion(shortest))
+        s = _dot(u, a)
+        return jnp.arctan2(2.0 * s * w, w * w - s * s)
+
     def find_normals(self, axis: Array) -> list[Array]:
         """Two directions across an axis `(3, joints, 1)` and each other."""
         a = _normalise(axis)
         smallest = jnp.argmin(jnp.abs(a), axis=0)
         other = jnp.stack([(smallest == i).astype(a.dtype) for i in range(3)])
-        cross = lambda a, b: jnp.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])  # noqa: E731
-        first = _normalise(cross(a, other))
-        return [first, cross(a, first)]
+        first = _normalise(_cross(a, other))
+        return [first, _cross(a, first)]
 
 
 BodyCoordinates = PlanarCoordinates | SpatialCoordinates
@@ -185,6 +205,16 @@ def choose_coordinates(name: str, state: PyTree) -> BodyCoordinates:
         f"{name}: got a state of type {type(state).__name__}, expected RigidBodies or PlanarBodies. "
         "What joins particles is springs.Rods."
     )
+
+
+def _dot(a: Array | list[Array], b: Array | list[Array]) -> Array:
+    """The scalar product of vectors in space, in components."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Their vector product."""
+    return jnp.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
 
 
 def _normalise(vectors: Array) -> Array:

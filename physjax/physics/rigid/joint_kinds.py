@@ -1,7 +1,7 @@
-"""Exact joints between bodies other than ball joints: welds, hinges, sliders and rods."""
+"""Exact joints without an axis other than ball joints: welds, rods and ropes."""
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Self, cast
 
 import equinox as eqx
 import jax
@@ -12,20 +12,19 @@ from jaxtyping import Array, Float, PyTree
 from physjax.checks import (
     OptionalNumbers,
     as_real_quantity,
-    demand_direction,
     quantity,
     unchecked_quantity,
 )
 from physjax.constraints.coordinates import Places
 from physjax.constraints.elimination import Pairs
+from physjax.constraints.ranges import Bounds, Rows, spread_bounds
 from physjax.physics.rigid.body_joints import (
     BodyJoints,
     check_joints,
     dot_components,
-    measure_turns,
-    put_joints_last,
     subtract_points,
 )
+from physjax.physics.rigid.turns import measure_turn, remember_turns
 
 
 class Welds(BodyJoints):
@@ -51,7 +50,7 @@ class Welds(BodyJoints):
         points: ArrayLike | Sequence,
         *,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Welds", pairs, points)
@@ -71,125 +70,42 @@ class Welds(BodyJoints):
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
         """From the first point to the second [m], and by how much the bodies have turned [rad]."""
         apart = subtract_points(self.place_ends(first, second))
-        return jnp.stack([*apart, *_measure_turn(self, self.turns, first, second)])
+        return jnp.stack([*apart, *measure_turn(self, self.turns, first, second)])
 
     def prepare(self, state: PyTree, mass: PyTree) -> "Welds":
         """The joints as part of a scene, with the turn of their bodies at its start."""
-        return _remember_turns(self, state, mass)
+        return cast("Welds", BodyJoints.prepare(remember_turns(self, state), state, mass))
 
 
-class Hinges(BodyJoints):
-    """A point of each of two bodies in space stays at that of the other, and they turn about an axis alone.
+class BodyDistances(BodyJoints):
+    """Joints that each hold a point of one body at a distance of `length` [m] from one of another."""
 
-    `axis` is a direction in the frames of both bodies, `(3,)` or `(joints, 3)`, or one in each, `(joints, 2, 3)`; of the world,
-    index -1, it is a direction in space. In the plane `Joints` are hinges. For the rest see `Joints`.
-
-    Example:
-        >>> hinges = rigid.Hinges([(-1, 0)], [[[0.0, 0.0, 0.0], [-0.25, 0.0, 0.0]]], axis=(0.0, 1.0, 0.0))
-        >>> door = Scene(rigid.bodies(brick, [[0.25, 0.0, 0.0]]), brick, (forces.Gravity(), hinges))
-        >>> round(float(constraint_forces(door)[0][0, 1]), 6) == round(float(-9.8 * brick.mass), 6)
-        True
-    """
-
-    pairs: Pairs = eqx.field(static=True)
-    points: Float[Array, "joints 2 3"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
-    axis: Float[Array, "joints 2 3"] = unchecked_quantity("axis", "1", kind="vector", per=None)
-
-    def __init__(
-        self,
-        pairs: ArrayLike | Sequence,
-        points: ArrayLike | Sequence,
-        axis: ArrayLike | Sequence,
-        *,
-        order: int = 2,
-        substeps: int = 1,
-        breaks_at: ArrayLike | Sequence | None = None,
-    ):
-        self.pairs, self.points = check_joints("Hinges", pairs, points)
-        if self.points.shape[-1] == 2:
-            raise ValueError(
-                "Hinges: got points in the plane, expected (joints, 2, 3); in the plane Joints are hinges."
-            )
-        axis = _check_axis("Hinges", axis, len(self.pairs), 3)
-        self.axis = jnp.broadcast_to(axis if axis.ndim == 3 else axis[:, None], self.points.shape)
-        self.set_options(order, substeps, breaks_at)
+    length: OptionalNumbers = quantity("length", "m", per="joint", above=0, default=None, kw_only=True)
 
     @property
     def rows(self) -> int:
-        """Three directions and two angles."""
-        return 5
+        """One distance."""
+        return 1
 
-    @property
-    def force_rows(self) -> int:
-        """The directions."""
-        return 3
+    def measure(self, first: Places, second: Places) -> Float[Array, "1 joints worlds"]:
+        """(d² - L²)/2L [m], which is d - L to first order."""
+        assert self.length is not None
+        apart = subtract_points(self.place_ends(first, second))
+        square = dot_components(apart, apart)
+        length = spread_bounds(self.length, square.shape)
+        return ((square - length * length) / (2 * length))[None]
 
-    def measure(self, first: Places, second: Places) -> Float[Array, "5 joints worlds"]:
-        """From the first point to the second [m], and the cosines of the first axis across the second."""
-        reader, axes = self.reader, jnp.moveaxis(self.axis, 0, 2)[..., None]
-        axis = reader.turn(first, axes[0] / jnp.sqrt(jnp.sum(axes[0] ** 2, axis=0, keepdims=True)))
-        across = [dot_components(axis, reader.turn(second, normal)) for normal in reader.find_normals(axes[1])]
-        return jnp.stack([*subtract_points(self.place_ends(first, second)), *across])
-
-
-class Sliders(BodyJoints):
-    """Two bodies move along an axis of the first alone, and do not turn relative to how they start: prismatic joints.
-
-    `axis` is a direction in the frame of the first body, `(dim,)` or `(joints, dim)`; the second point stays on the line
-    through the first. For the rest see `Joints`.
-
-    Example:
-        >>> plate = inertia.planar_plate(1.0, (0.2, 0.2))
-        >>> rail = rigid.Sliders([(-1, 0)], [[[0.0, 0.0], [0.0, 0.0]]], axis=(1.0, 1.0))
-        >>> start = Scene(rigid.planar_bodies(plate, [[0.0, 0.0]]), plate, (forces.Gravity(), rail))
-        >>> round(float(abs(constraint_forces(start)[0][0, 0])), 4), round(9.8 * 0.5**0.5, 4)
-        (6.9296, 6.9296)
-    """
-
-    pairs: Pairs = eqx.field(static=True)
-    points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
-    axis: Float[Array, "joints dim"] = unchecked_quantity("axis", "1", kind="vector", per=None)
-    turns: Float[Array, "..."] | None = unchecked_quantity("turn at the start", "rad", per="joint", default=None)
-
-    def __init__(
-        self,
-        pairs: ArrayLike | Sequence,
-        points: ArrayLike | Sequence,
-        axis: ArrayLike | Sequence,
-        *,
-        order: int = 2,
-        substeps: int = 1,
-        breaks_at: ArrayLike | Sequence | None = None,
-    ):
-        self.pairs, self.points = check_joints("Sliders", pairs, points)
-        dim = self.points.shape[-1]
-        self.axis = jnp.broadcast_to(_check_axis("Sliders", axis, len(self.pairs), dim), (len(self.pairs), dim))
-        self.set_options(order, substeps, breaks_at)
-        self.turns = None
-
-    @property
-    def rows(self) -> int:
-        """All but one of the ways to move: 2 in the plane, 5 in space."""
-        return 2 if self.points.shape[-1] == 2 else 5
-
-    @property
-    def force_rows(self) -> int:
-        """The directions across the axis."""
-        return self.points.shape[-1] - 1
-
-    def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
-        """From the first point to the second across the axis [m], and by how much the bodies have turned [rad]."""
-        apart, reader = subtract_points(self.place_ends(first, second)), self.reader
-        normals = reader.find_normals(self.axis.T[..., None])
-        across = [dot_components(apart, reader.turn(first, normal)) for normal in normals]
-        return jnp.stack([*across, *_measure_turn(self, self.turns, first, second)])
-
-    def prepare(self, state: PyTree, mass: PyTree) -> "Sliders":
-        """The joints as part of a scene, with the turn of their bodies at its start."""
-        return _remember_turns(self, state, mass)
+    def prepare(self, state: PyTree, mass: PyTree) -> Self:
+        """The joints with their lengths, as part of a scene."""
+        joints = self
+        if self.length is None:
+            what = f"distance between the points of {type(self).__name__.lower()} [m]"
+            length = as_real_quantity(what, _measure_distances(self, state), above=0.0)
+            joints = eqx.tree_at(lambda joints: joints.length, self, length, is_leaf=lambda leaf: leaf is None)
+        return cast("Self", BodyJoints.prepare(joints, state, mass))
 
 
-class Rods(BodyJoints):
+class Rods(BodyDistances):
     """A point of one body stays at a distance from one of another: `springs.Rods` between points of bodies.
 
     `length` [m] is one for all or one each; None: as far apart as the points start. For the rest see `Joints`.
@@ -204,7 +120,6 @@ class Rods(BodyJoints):
 
     pairs: Pairs = eqx.field(static=True)
     points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
-    length: OptionalNumbers = quantity("length", "m", per="joint", above=0, default=None)
 
     def __init__(
         self,
@@ -213,66 +128,59 @@ class Rods(BodyJoints):
         length: ArrayLike | Sequence | None = None,
         *,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Rods", pairs, points)
         self.length = None if length is None else as_real_quantity("length [m]", length, above=0.0)
         self.set_options(order, substeps, breaks_at)
 
+
+class Ropes(BodyDistances):
+    """Points of two bodies are no farther apart than `length` [m]: `springs.Ropes` between points of bodies.
+
+    `length` is one for all or one each; None: as far apart as the points start. For the rest see `Joints`.
+
+    Example:
+        >>> plate = inertia.planar_plate(1.0, (0.2, 0.2))
+        >>> tied = rigid.planar_bodies(plate, [[0.0, -0.1]], velocity=[[0.0, -1.0]])
+        >>> ropes = rigid.Ropes([(-1, 0)], [[[0.0, 0.0], [0.0, 0.1]]], length=0.5)
+        >>> end = simulate(Scene(tied, plate, (ropes,)), methods.verlet, dt=0.01, duration=1.0).final_scene.state
+        >>> print(end.position[0].round(6), end.momentum[0].round(6))
+        [ 0.  -0.6] [0. 0.]
+    """
+
+    pairs: Pairs = eqx.field(static=True)
+    points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
+
+    def __init__(
+        self,
+        pairs: ArrayLike | Sequence,
+        points: ArrayLike | Sequence,
+        length: ArrayLike | Sequence | None = None,
+        *,
+        substeps: int | None = 1,
+        breaks_at: ArrayLike | Sequence | None = None,
+    ):
+        self.pairs, self.points = check_joints("Ropes", pairs, points)
+        self.length = None if length is None else as_real_quantity("length [m]", length, above=0.0)
+        self.set_options(2, substeps, breaks_at)
+
     @property
-    def rows(self) -> int:
-        """A rod keeps one distance."""
-        return 1
+    def bounded(self) -> bool:
+        """Ropes hold on one side."""
+        return True
 
-    def measure(self, first: Places, second: Places) -> Float[Array, "1 joints worlds"]:
-        """(d² - L²)/2L [m], which is d - L to first order."""
-        assert self.length is not None
-        apart = subtract_points(self.place_ends(first, second))
-        length = put_joints_last(jnp.broadcast_to(self.length, (*self.length.shape[:-1], len(self.pairs))), 1)[0]
-        return ((dot_components(apart, apart) - length * length) / (2 * length))[None]
-
-    def prepare(self, state: PyTree, mass: PyTree) -> "Rods":
-        """The rods with their lengths, as part of a scene."""
-        rods = self
-        if self.length is None:
-            length = as_real_quantity(
-                "distance between the points of rods [m]", _measure_distances(self, state), above=0.0
-            )
-            rods = eqx.tree_at(lambda rods: rods.length, self, length, is_leaf=lambda leaf: leaf is None)
-        return cast("Rods", BodyJoints.prepare(rods, state, mass))
+    def find_bounds(self, like: Rows) -> Bounds:
+        """No longer than they are."""
+        return Bounds.hold(like)._replace(low=jnp.full_like(like, -jnp.inf))
 
 
 @jax.jit
-def _measure_distances(rods: Rods, state: PyTree) -> Array:
-    """How far the points of rods are apart [m], `(*scenes, rods)`."""
-    apart = subtract_points(rods.place_ends(*rods.find_ends(rods.coordinates(state).read_places(state))))
-    return jnp.sqrt(dot_components(apart, apart)).T.reshape(*state.lanes[:-1], len(rods.pairs))
+def _measure_distances(joints: BodyDistances, state: PyTree) -> Array:
+    """How far the points of each are apart [m], `(*scenes, rods)`."""
+    apart = subtract_points(joints.place_ends(*joints.find_ends(joints.coordinates(state).read_places(state))))
+    return jnp.sqrt(dot_components(apart, apart)).T.reshape(*state.lanes[:-1], len(joints.pairs))
 
 
-def _measure_turn(part: Welds | Sliders, turns: Array | None, first: Places, second: Places) -> list[Array]:
-    """By how much the bodies have turned relative to each other [rad], in rows."""
-    assert turns is not None
-    reader = part.reader
-    turn = reader.compare(first, second)
-    return reader.measure_turn(turn, put_joints_last(turns, len(turn)))
-
-
-def _remember_turns(part: PyTree, state: PyTree, mass: PyTree) -> PyTree:
-    """The joints with the turn of their bodies, which they keep if they have one."""
-    if part.turns is None and part.points.shape[-1] == part.coordinates(state).dim:
-        turns = measure_turns(part, state)
-        part = eqx.tree_at(lambda part: part.turns, part, turns, is_leaf=lambda leaf: leaf is None)
-    return BodyJoints.prepare(part, state, mass)
-
-
-def _check_axis(name: str, axis: ArrayLike | Sequence, joints: int, dim: int) -> Array:
-    """Directions, `(1, dim)`, `(joints, dim)` or `(joints, 2, dim)`."""
-    found = as_real_quantity("axis [1]", axis)
-    if found.shape not in ((dim,), (joints, dim), (joints, 2, dim)) or (found.ndim == 3 and name != "Hinges"):
-        raise ValueError(f"{name}: got an axis of shape {found.shape}, expected {(dim,)} or {(joints, dim)}.")
-    demand_direction("axis", found)
-    return found[None] if found.ndim == 1 else found
-
-
-__all__ = ["Hinges", "Rods", "Sliders", "Welds"]
+__all__ = ["BodyDistances", "Rods", "Ropes", "Welds"]

@@ -16,10 +16,21 @@ from physjax.checks import (
     quantity,
     unchecked_quantity,
 )
-from physjax.constraints.coordinates import Places
+from physjax.constraints.constraint import PushedRows
+from physjax.constraints.coordinates import Coordinates, Places
 from physjax.constraints.elimination import Pairs
+from physjax.constraints.ranges import Bounds, Rows, spread_bounds
 from physjax.loops import Time
-from physjax.physics.rigid.body_joints import BodyJoints, check_joints, read_bodies, subtract_points
+from physjax.physics.rigid.body_joints import (
+    BodyJoints,
+    as_axes,
+    check_joints,
+    differentiate_cosine,
+    differentiate_rows,
+    dot_components,
+    read_bodies,
+    subtract_points,
+)
 from physjax.physics.rigid.inertia import Inertia
 from physjax.physics.rigid.planar.bodies import PlanarBodies
 from physjax.physics.rigid.spatial import RigidBodies, Wrench, angular_velocity
@@ -33,6 +44,9 @@ class Joints(BodyJoints):
     frames of the two bodies, from their centers of mass. Without a stiffness joints are exact, as `springs.Rods` are, with
     the same `order`, `substeps` and `breaks_at`: they add no stiffness, open by no load, and `constraint_forces` gives their
     forces.
+
+    With a `cone` [rad] joints in space turn only so far that the `axis` of the first body and that of the second, directions
+    in the frames of both, `(3,)` or `(joints, 3)`, or one in each, `(joints, 2, 3)`, are no more than that angle apart.
 
     With a `stiffness` k [N/m] and a `damping` c [kg/s], shared or per joint, they are springs between bodies in space,
     F = k d + c ḋ, with d from the first point to the second: the points separate by about load/k, and a step must resolve
@@ -53,6 +67,8 @@ class Joints(BodyJoints):
     points: Float[Array, "joints 2 dim"] = unchecked_quantity("points of the joints", "m", kind="place", per=None)
     stiffness: OptionalNumbers = quantity("stiffness k", "N/m", per="joint", above=0, default=None)
     damping: Numbers = quantity("damping c", "kg/s", per="joint", at_least=0, default=0.0)
+    axis: Float[Array, "joints 2 3"] | None = unchecked_quantity("axis", "1", kind="vector", per=None, default=None)
+    cone: OptionalNumbers = quantity("cone", "rad", per="joint", above=0, default=None)
 
     def __init__(
         self,
@@ -61,20 +77,36 @@ class Joints(BodyJoints):
         stiffness: ArrayLike | Sequence | None = None,
         damping: ArrayLike | Sequence = 0.0,
         *,
+        axis: ArrayLike | Sequence | None = None,
+        cone: ArrayLike | Sequence | None = None,
         order: int = 2,
-        substeps: int = 1,
+        substeps: int | None = 1,
         breaks_at: ArrayLike | Sequence | None = None,
     ):
         self.pairs, self.points = check_joints("Joints", pairs, points)
+        self._set_cone(axis, cone)
         self.stiffness = None if stiffness is None else as_real_quantity("stiffness k [N/m]", stiffness, above=0.0)
         self.damping = as_real_quantity("damping c [kg/s]", damping, at_least=0.0)
         self.set_options(order, substeps, breaks_at)
+        if cone is not None and (order != 2 or stiffness is not None):
+            raise ValueError(
+                f"Joints: got a cone, order={order} and stiffness={stiffness}, expected exact joints of order 2."
+            )
         if self.stiffness is not None and breaks_at is not None:
             raise ValueError("Joints: got a stiffness and breaks_at, expected one of them: springs do not break.")
         if self.stiffness is not None and (np.asarray(self.pairs) < 0).any():
             raise ValueError(
                 "Joints: got the world, -1, and a stiffness; springs to the world are AtPoint(point, Anchor(...))."
             )
+
+    def _set_cone(self, axis: ArrayLike | Sequence | None, cone: ArrayLike | Sequence | None) -> None:
+        """Check and set how far joints turn."""
+        if (axis is None) != (cone is None) or (cone is not None and self.points.shape[-1] == 2):
+            raise ValueError(
+                f"Joints: got axis={axis} and cone={cone}, expected both, in space, or none. In the plane `Hinges` have limits."
+            )
+        self.cone = None if cone is None else as_real_quantity("cone [rad]", cone, above=0.0, at_most=np.pi)
+        self.axis = None if axis is None else as_axes("Joints", axis, len(self.pairs))
 
     @property
     def response(self) -> Callable | None:
@@ -83,12 +115,50 @@ class Joints(BodyJoints):
 
     @property
     def rows(self) -> int:
-        """As many as there are directions."""
+        """As many as there are directions, and one for a cone."""
+        return self.points.shape[-1] + self.bounded
+
+    @property
+    def force_rows(self) -> int:
+        """The directions."""
         return self.points.shape[-1]
 
-    def measure(self, first: Places, second: Places) -> Float[Array, "dim joints worlds"]:
-        """From the first point to the second [m]."""
-        return jnp.stack(subtract_points(self.place_ends(first, second)))
+    @property
+    def bounded(self) -> bool:
+        """Whether they have a cone."""
+        return self.cone is not None
+
+    def find_bounds(self, like: Rows) -> Bounds:
+        """The cosine of the angle of a cone is the least."""
+        bounds = Bounds.hold(like)
+        if self.cone is None:
+            return bounds
+        least = spread_bounds(jnp.cos(self.cone), like.shape[1:]).astype(like.dtype)[None]
+        extend = lambda last: jnp.concatenate([like[:-1], last])  # noqa: E731
+        return bounds._replace(low=extend(least), high=extend(jnp.full_like(least, jnp.inf)))
+
+    def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
+        """From the first point to the second [m], and the cosine of the angle between the axes."""
+        rows = subtract_points(self.place_ends(first, second))
+        return jnp.stack(rows if self.axis is None else [*rows, dot_components(*self._turn_axes(first, second))])
+
+    def differentiate(self, reader: Coordinates, first: Places, second: Places) -> tuple[Rows, PushedRows, PushedRows]:
+        """The rows and their change with moves of either end, in space in closed form."""
+        if self.points.shape[-1] == 2:
+            return super().differentiate(reader, first, second)
+        ends, angles = self.place_ends(first, second), []
+        rows = subtract_points(ends)
+        if self.axis is not None:
+            axes = self._turn_axes(first, second)
+            rows.append(dot_components(*axes))
+            angles.append(differentiate_cosine(*axes))
+        return jnp.stack(rows), *differentiate_rows(ends, (first, second), angles)
+
+    def _turn_axes(self, first: Places, second: Places) -> tuple[list[Array], list[Array]]:
+        """The axes of both bodies of each joint in the world frame."""
+        axes = jnp.moveaxis(jnp.asarray(self.axis), 0, 2)[..., None]
+        a, b = axes / jnp.sqrt(jnp.sum(axes * axes, axis=1, keepdims=True))
+        return self.reader.turn(first, a), self.reader.turn(second, b)
 
     def prepare(self, state: PyTree, mass: PyTree) -> Self:
         """The joints as part of a scene; exact ones are closed at its start."""
@@ -127,7 +197,7 @@ class Joints(BodyJoints):
 
     def error(self, bodies: RigidBodies | PlanarBodies) -> Float[Array, "*scenes joints"]:
         """How far the two points of each joint are apart [m]."""
-        apart = self.measure(*self.find_ends(read_bodies(bodies)))
+        apart = jnp.stack(subtract_points(self.place_ends(*self.find_ends(read_bodies(bodies)))))
         return norm(jnp.moveaxis(apart, (0, 1, 2), (2, 1, 0))).reshape(*bodies.lanes[:-1], len(self.pairs))
 
     def _locate_ends(self, bodies: RigidBodies, *more: Array) -> list[Array]:

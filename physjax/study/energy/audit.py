@@ -17,13 +17,14 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
+from physjax.constraints.reactions import find_stops, split_rate
 from physjax.loops import Moment, Time, moment_at
 from physjax.particles import callable_name
 from physjax.parts import Force
 from physjax.physics.contacts.time_of_impact import Flight, fold_flights, impact
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.planar.response import solve_contacts
 from physjax.physics.rigid.response import collide, fold_body_flights
+from physjax.physics.rigid.solids.response import solve_contacts
 from physjax.physics.rigid.spatial import RigidBodies
 from physjax.scene import Scene
 from physjax.stages import Stage
@@ -33,7 +34,7 @@ from physjax.study.energy.solids import fold_solid_flights
 from physjax.trajectory import Trajectory
 from physjax.vectors import scale
 
-NUMERICAL, PINS, PIVOTS = "numerical", "pins", "pivots"
+NUMERICAL, PINS, PIVOTS, CLOSING = "numerical", "pins", "pivots", "closing joints"
 RESPONSE_OBSERVERS = {impact: fold_flights, collide: fold_body_flights, solve_contacts: fold_solid_flights}
 """How the legs of a response's steps are observed: of particles, of bodies in space, and of bodies in the plane."""
 Amounts = dict[str, Array]
@@ -93,6 +94,7 @@ def list_causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
         if _may_lose_energy(force)
     ]
     holding = [PINS] if scene.pinned is not None else []
+    holding += [CLOSING] if scene.constraints and scene.contacts else []
     holding += [PIVOTS] if isinstance(scene.mass, Inertia) and scene.mass.arm is not None else []
     contacts = name_parts(scene.contacts)
     return name_parts(scene.forces), contacts, [*breaking, *holding, NUMERICAL]
@@ -181,8 +183,7 @@ def _audit_step(
         if stage.name == "resolve contacts" and stage.part is not None:
             budget = _enter(budget, contacts[stage.part], change)
         elif stage.name == "close joints":
-            # impulses between bodies, due to what the contacts have done to them
-            budget = _enter(budget, contacts[-1], change)
+            budget = _enter(budget, CLOSING, change)
         elif stage.name == "advance memory" and stage.part is not None:
             loses = _may_lose_energy(scene.forces[stage.part])
             budget = _enter(budget, f"{forces[stage.part]} parted" if loses else NUMERICAL, change)
@@ -249,13 +250,24 @@ def _record_flight(whole: Scene, substeps: Array, budget: EnergyBudget, flight: 
             entries[PINS] = _mask_amounts(held, holding)
             leaning = [share & ~held for share in leaning]
         entries = _add_entries(entries, _split_by_contact(contacts, leaning, holding))
-    elif whole.constraints or PINS in budget or PIVOTS in budget:
-        # what holds joints does no work, and gives momentum where it is fixed in the world
-        joints = [name for name, force in zip(names, whole.forces, strict=True) if force.response is not None]
-        entries[next(name for name in (PINS, PIVOTS, *joints) if name in budget)] = holding
+    elif PINS in budget or PIVOTS in budget:
+        entries[next(name for name in (PINS, PIVOTS) if name in budget)] = holding
+    entries = _enter_stops(whole, start, end, entries)
     if flight.active is not None:
         entries = {name: _mask_amounts(flight.active, entry) for name, entry in entries.items()}
     return _add_entries(budget, entries)
+
+
+def _enter_stops(whole: Scene, start: Scene, end: PyTree, entries: EnergyBudget) -> EnergyBudget:
+    """The entries, with what the exact motion of a step does not have given to the joints that came to a limit in it."""
+    lost = entries[NUMERICAL]
+    named = zip(name_parts(whole.forces), whole.forces, strict=True)
+    joints = [name for name, force in named if force.response is not None]
+    for name, came in zip(joints, find_stops(whole, start.state, end) if joints else (), strict=True):
+        if came is not None:
+            entries = _add_entries(entries, {name: _mask_amounts(came, lost)})
+            lost = _mask_amounts(~came, lost)
+    return entries | {NUMERICAL: lost}
 
 
 def _find_nearest_contact(scene: Scene, timed: list[bool], t: Array, state: PyTree) -> list[Array]:
@@ -325,10 +337,14 @@ def _integrate_exactly(
 
 def _compute_rates(whole: Scene, scene: Scene, t: Array, state: PyTree) -> tuple[PyTree, list[Amounts], Amounts]:
     """Time derivative of the state, and what each force, and what the constraints bring in a second."""
-    rate = scene.rate(t, state)
+    rate, joined = split_rate(scene, t, state)
     felt = state if scene.prescribed_motion is None else scene.prescribed_motion.prescribe(t, state)
     felt = felt.on_pivot(scene.mass) if isinstance(felt, RigidBodies) else felt
-    works = [_transfer_rates(whole, t, felt, _single_force_rate(scene, t, felt, force)) for force in scene.forces]
+    alone = [_single_force_rate(scene, t, felt, force) for force in scene.forces]
+    for part, joints in zip(whole.constraints, joined, strict=True):
+        # two parts that are equal are two
+        alone[[force is part for force in whole.forces].index(True)] = joints
+    works = [_transfer_rates(whole, t, felt, rate) for rate in alone]
     holding = _transfer_rates(whole, t, felt, rate)
     for work in works:
         holding = _subtract(holding, work)

@@ -10,8 +10,8 @@ from jaxtyping import PyTree
 
 from physjax.loops import Time
 from physjax.physics.contacts.time_of_impact import Flight
-from physjax.physics.rigid.planar import Solids
-from physjax.physics.rigid.planar.response import solve_contacts
+from physjax.physics.rigid.solids.contact import Solids
+from physjax.physics.rigid.solids.response import solve_contacts
 from physjax.scene import Scene
 
 B = TypeVar("B")

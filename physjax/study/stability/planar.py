@@ -15,7 +15,8 @@ from jaxtyping import Array
 from physjax.loops import Time
 from physjax.particles import Particles, callable_name
 from physjax.parts import Force
-from physjax.physics.rigid.planar import PlanarBodies, PlanarInertia, Solids
+from physjax.physics.rigid.planar import PlanarBodies, PlanarInertia
+from physjax.physics.rigid.solids.contact import Solids
 from physjax.scene import Scene
 from physjax.study.stability.joint_forces import JointForces, find_joint_rate
 from physjax.vectors import scale

@@ -96,7 +96,10 @@ def test_rods_between_bodies_keep_their_length_and_different_joints_hold_togethe
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: rigid.Hinges([(-1, 0)], [[[0.0, 0.0], [0.0, 0.0]]], (0.0, 1.0)), "in the plane Joints are hinges"),
+        (
+            lambda: rigid.Hinges([(-1, 0)], [[[0.0, 0.0], [0.0, 0.0]]], (0.0, 1.0)),
+            "an axis in space and none in the plane",
+        ),
         (lambda: rigid.Hinges([(-1, 0)], jnp.zeros((1, 2, 3)), (0.0, 0.0, 0.0)), "a vector that is not zero"),
         (lambda: rigid.Sliders([(-1, 0)], jnp.zeros((1, 2, 3)), (1.0, 0.0)), r"axis of shape \(2,\)"),
         (lambda: rigid.Welds([(-2, 0)], jnp.zeros((1, 2, 3))), "there are 1 places in the world"),

@@ -7,8 +7,8 @@ import pytest
 
 from physjax import rigid
 from physjax.physics.rigid.planar.manifolds import Outline, find_manifolds
-from physjax.physics.rigid.planar.pairs import group_contacts
 from physjax.physics.rigid.planar.shapes import tabulate_shapes
+from physjax.physics.rigid.solids.pairs import group_contacts
 
 SHAPES = {
     "disc": rigid.PlanarShape.disc(0.4),

@@ -110,12 +110,21 @@ def test_energy_is_kept_without_a_trend():
     assert abs(trend) < 1e-6 * 2 * G
 
 
-@pytest.mark.parametrize(
-    "scene",
-    [chain(20, 1800.0, 0.1, substeps=8), chain(30, 100.0, 0.3, sag=0.5, substeps=8)],
-    ids=["heavy rope", "bridge"],
-)
-def test_no_mass_ratio_opens_a_rod(scene):
+def test_a_rope_whipped_by_a_load_of_1800_times_a_link_stays_closed_and_keeps_its_energy():
+    links = 20
+    x = jnp.linspace(0.0, 2.0, links + 1)[:, None] * jnp.array([[1.0, 0.0]])
+    mass = np.where(np.arange(links + 1) < links, 1.0, 1800.0)
+    rods = springs.Rods([(i, i + 1) for i in range(links)], substeps=None)
+    scene = Scene(Particles(x, jnp.zeros_like(x)), mass, (forces.Gravity(G), rods), pinned=np.arange(links + 1) == 0)
+    film = simulate(scene, methods.verlet, dt=1 / 120, steps=1200, save_every=40)
+    assert np.abs(find_openings(scene, film)[0]).max() < 1e-10
+    stored = np.asarray(jax.vmap(lambda t, s: energy.total(scene, t, s))(film.time, film.state))
+    # of what the load falls from its height to the bottom
+    assert np.abs(stored - stored[0]).max() < 2e-3 * 1800.0 * G * 2.0
+
+
+def test_no_mass_ratio_opens_a_rod():
+    scene = chain(30, 100.0, 0.3, sag=0.5, substeps=8)
     film = simulate(scene, methods.verlet, dt=1 / 120, steps=120)
     stretch, opening = find_openings(scene, film)
     pinned = np.asarray(scene.pinned)
@@ -256,14 +265,6 @@ def test_bad_rods_are_refused_in_plain_words(build, message):
     x = jnp.array([[0.0, 0.0], [1.0, 0.0]])
     with pytest.raises(ValueError, match=message):
         Scene(Particles(x, jnp.zeros_like(x)), forces=(build(x),))
-
-
-def test_the_ledger_books_no_work_to_rods_and_their_push_on_the_anchor():
-    film = simulate(pendulum([1.0, 0.5], acting=(forces.StokesDrag(0.1),)), methods.verlet, dt=0.01, steps=20)
-    ledger = energy.ledger(film)
-    assert abs(ledger.energy.totals["Rods"]) < 1e-12
-    assert ledger.momentum.closure_error < 1e-12
-    assert np.linalg.norm(ledger.momentum.totals["Rods"]) > 1.0
 
 
 def test_rods_add_no_stiffness_the_limit_is_that_of_the_swing():

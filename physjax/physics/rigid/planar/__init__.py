@@ -8,14 +8,13 @@
     Scene(pile, crate, (forces.Gravity(),), contacts=(solids,))
 
 A body turns by one angle about one axis: nothing of quaternions or tensors is compiled. `bodies` is the state record,
-`manifolds` and `surfaces` find where shapes touch, `impulses` holds them apart, `impacts` lets them bounce, and
-`response` is a step of all that; `contact_state` tells between steps where they touch.
+`manifolds` and `surfaces` find where shapes touch, and `impulses` holds them apart; `mechanics` hands these to the step of
+`rigid.solids`. `contact_state` tells between steps where bodies touch.
 """
 
 from physjax.physics.rigid.planar.bodies import PlanarBodies, planar_bodies
 from physjax.physics.rigid.planar.contact_state import PlanarContacts, find_planar_contacts
 from physjax.physics.rigid.planar.shapes import PlanarShape
-from physjax.physics.rigid.planar.solids import Solids
 from physjax.physics.rigid.planar_inertia import PlanarInertia
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "PlanarContacts",
     "PlanarInertia",
     "PlanarShape",
-    "Solids",
     "find_planar_contacts",
     "planar_bodies",
 ]

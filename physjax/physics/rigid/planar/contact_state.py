@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float
 
 from physjax.loops import Time, to_float_time
 from physjax.physics.rigid.planar.bodies import PlanarBodies
-from physjax.physics.rigid.planar.response import read_pose
-from physjax.physics.rigid.planar.solids import Solids
+from physjax.physics.rigid.planar.mechanics import PLANE
 from physjax.physics.rigid.planar.surfaces import Slot, list_slots
-from physjax.physics.rigid.planar.touching import SolidContact, build_world, find_contacts
+from physjax.physics.rigid.solids.contact import Solids
+from physjax.physics.rigid.solids.world import SolidContact, build_world
 from physjax.scene import Scene
 
 STEADY_FACTOR = 2.0
@@ -104,7 +104,7 @@ def _find_contacts(scene: Scene, solids: Solids, slots: list[Slot], t: ArrayLike
     if not solids.pairs and not slots:
         raise ValueError("find_planar_contacts: got solids without pairs or surfaces, expected some that can touch.")
     world, worlds = build_world(cast("SolidContact", solids), scene), scene.state.lanes[:-1]
-    contacts, gaps, (x, y) = find_contacts(world, read_pose(scene.state, scene).place, t)
+    contacts, gaps, (x, y) = PLANE.find_contacts(world, PLANE.read_pose(scene.state, scene).place, t)
     # each contact's place in the groups; places that are left over come last
     count = len(solids.pairs or ()) + len(slots) * world.size
     places = jnp.asarray(np.argsort(world.groups.contact.ravel(), kind="stable")[:count])

@@ -1,15 +1,10 @@
-"""The impulses at all contacts: group after group, each contact of a group at the same time.
-
-A contact asks for a speed of separation along its normal, softly or not, with impulses that only push; friction stops
-the slip, with at most μ times those. What a sweep asks for is its `Demand`: the places after a sub-step, the
-velocities at its end, and the speeds after an impact are found by the same sweep.
+"""The impulses of a contact in the plane.
 
 A contact has one normal and one or two points, and so three directions: the tangent, in which the friction at both points
 acts along one line, and the normal at each point.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -18,22 +13,15 @@ from jaxtyping import Array
 
 from physjax.backend import materialise
 from physjax.physics.rigid.planar.manifolds import Vector
-from physjax.physics.rigid.planar.pairs import Groups
+from physjax.physics.rigid.solids.mechanics import ALTERNATIONS, SOFT, Demand, Impulses, Points, Sides, Speeds, Velocity
 
 MIN_DETERMINANT_SHARE = 1e-3
 """Share of the product of its diagonal below which the matrix of two points has none: they are as good as one."""
 
-ALTERNATIONS = 2
-"""Of normal and friction within a contact."""
-
-Sides = tuple[Array, Array]
-"""The same number of both bodies of each contact."""
-Points = tuple[Array, Array]
+Both = tuple[Array, Array]
 """The same number at both points of each contact."""
-Velocity = tuple[Array, Array, Array]
-"""Velocities of bodies along x and y [m/s] and of their angles [rad/s], each `(bodies, worlds)`."""
-Impulses = tuple[Array, Array, Array]
-"""Impulses [N s] of contacts along the tangent and along the normal at both points, each `(contacts, worlds)`."""
+Directions = tuple[Array, Array, Array]
+"""A number of contacts along the tangent and along the normal at both points, each `(contacts, worlds)`."""
 
 
 class Contacts(NamedTuple):
@@ -47,52 +35,13 @@ class Contacts(NamedTuple):
     """
 
     normal: Vector
-    torque: tuple[Impulses, Impulses]
+    torque: tuple[Directions, Directions]
     carried: Vector
     coupling: tuple[Array, ...]
     mass: Sides
     moment: Sides
     friction: Array
-    is_point: Points
-
-
-class Demand(NamedTuple):
-    """What a sweep asks of each point: its speed of separation [m/s] at least, and how.
-
-    A point that `yields` is asked softly: its impulse is less by as much as a spring gives way (`Softness`). Where it is not
-    `active` there is no impulse.
-    """
-
-    speed: Points
-    yields: Points
-    active: Points
-
-    @classmethod
-    def hard(cls, speed: Points, active: Points) -> "Demand":
-        """These speeds, of those that are active."""
-        none = jnp.zeros_like(active[0])
-        return cls(speed, (none, none), active)
-
-
-class Softness(NamedTuple):
-    """A contact spring and damper as numbers of a solver: the share of an overlap cured in a sub-step, and how it yields.
-
-    With ω h and ζ, cure = ωh/(2ζ + ωh), and the impulse is that of a hard contact whose matrix has a diagonal larger by the
-    factor `yielding` = 1 + 1/(ωh (2ζ + ωh)): E. Catto, "Soft Constraints" (2011).
-    """
-
-    cure: float
-    yielding: float
-
-    @classmethod
-    def of(cls, periods: float, damping_ratio: float) -> "Softness":
-        """Of a spring with a period of as many sub-steps."""
-        angle = 6.283185307179586 / periods
-        return cls(angle / (2 * damping_ratio + angle), 1 + 1 / (angle * (2 * damping_ratio + angle)))
-
-
-SOFT = Softness.of(periods=2.0, damping_ratio=0.5)
-"""As stiff as a sub-step resolves: with a longer period towers lean and sway, and with more damping they take longer to stop."""
+    is_point: Both
 
 
 def build_contacts(
@@ -119,49 +68,16 @@ def build_contacts(
     return Contacts(normal, torque, (across, along), coupling, mass, (ia, ib), friction, points)
 
 
-def sweep_contacts(
-    velocity: Velocity, groups: Groups, contacts: Contacts, demand: Demand, impulses: Impulses
-) -> tuple[Velocity, Impulses]:
-    """Velocities of all rows and impulses of all groups after each contact was solved once, group after group.
-
-    The velocities are those that the impulses given have brought about. Each array is one component: XLA on a CPU computes
-    what is stacked once for every part of it, and without vector instructions.
-    """
-
-    def solve(velocity: Velocity, group: tuple) -> tuple[Velocity, Impulses]:
-        (a, b), contacts, demand, impulses = group
-        ends = _pick_rows(velocity, a), _pick_rows(velocity, b)
-        new = _solve_contact(_find_speeds(ends, contacts), contacts, demand, impulses)
-        change = _find_changes(contacts, map_components(jnp.subtract, new, impulses))
-        for rows, end, more in zip((a, b), ends, change, strict=True):
-            write = lambda part, e, m, rows=rows: part.at[rows].set(e + m, unique_indices=True)  # noqa: E731
-            velocity = map_components(write, velocity, end, more)
-        return velocity, new
-
-    rows = jnp.asarray(groups.a), jnp.asarray(groups.b)
-    return lax.scan(solve, velocity, (rows, contacts, demand, impulses))
-
-
-def _pick_rows(velocity: Velocity, rows: Array) -> Velocity:
-    return map_components(lambda part: part[rows], velocity)
-
-
-def map_components(function: Callable[..., Array], *parts: tuple[Any, Any, Any]) -> tuple[Array, Array, Array]:
-    """The function of three components, one by one."""
-    x, y, z = (function(*each) for each in zip(*parts, strict=True))
-    return x, y, z
-
-
-def _find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Impulses:
+def find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Directions:
     """How fast b moves away from a along each direction [m/s]."""
     ((ax, ay, aw), (bx, by, bw)), (nx, ny), (across, along) = ends, contacts.normal, contacts.carried
     dx, dy = bx - ax, by - ay
-    turning = map_components(lambda a, b: b * bw - a * aw, *contacts.torque)
+    turning = [b * bw - a * aw for a, b in zip(*contacts.torque, strict=True)]
     straight = nx * dx + ny * dy + along
     return nx * dy - ny * dx + across + turning[0], straight + turning[1], straight + turning[2]
 
 
-def _find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
+def find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
     """What impulses on b, and the opposite ones on a, change in the velocities of both."""
     (nx, ny), across, along = contacts.normal, impulses[0], impulses[1] + impulses[2]
     px, py = nx * along - ny * across, ny * along + nx * across
@@ -170,7 +86,7 @@ def _find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Vel
     return (-ma * px, -ma * py, -ia * sa), (mb * px, mb * py, ib * sb)
 
 
-def _solve_contact(speed: Impulses, contacts: Contacts, demand: Demand, impulses: Impulses) -> Impulses:
+def solve_contact(speed: Speeds, contacts: Contacts, demand: Demand, impulses: Impulses) -> Impulses:
     """The impulses of each contact: friction, then both normals together, in turns."""
     own, first, second, *matrix = contacts.coupling
     there = [is_point & active for is_point, active in zip(contacts.is_point, demand.active, strict=True)]
@@ -180,21 +96,21 @@ def _solve_contact(speed: Impulses, contacts: Contacts, demand: Demand, impulses
     effect = [sum(k * impulse for k, impulse in zip(row, impulses, strict=True)) for row in rows]
     slip, *targets = (asked - v + part for asked, v, part in zip(wanted, speed, effect, strict=True))
 
-    def grip(press: Points) -> Array:
+    def grip(press: Both) -> Array:
         most = contacts.friction * (press[0] + press[1])
         held = (slip - first * press[0] - second * press[1]) / jnp.where(own > 0, own, jnp.inf)
         return jnp.where(there[0] | there[1], jnp.clip(held, -most, most), 0.0)
 
-    def alternate(press: Points, _: None) -> tuple[Points, None]:
+    def alternate(press: Both, _: None) -> tuple[Both, None]:
         friction = grip(press)
         left = targets[0] - first * friction, targets[1] - second * friction
         return _press_both(matrix, left, demand.yields, there), None
 
-    press, _ = lax.scan(alternate, impulses[1:], length=ALTERNATIONS)
+    press, _ = lax.scan(alternate, (impulses[1], impulses[2]), length=ALTERNATIONS)
     return grip(press), *press
 
 
-def _press_both(matrix: list[Array], wanted: Points, yields: Points, there: list[Array]) -> Points:
+def _press_both(matrix: list[Array], wanted: Both, yields: Points, there: list[Array]) -> Both:
     """The normal impulses x >= 0 of two points with K x >= wanted, where either is met: solved exactly, as a box rocks.
 
     K holds the changes of speed by unit impulses; softness makes its diagonal larger.
@@ -216,38 +132,4 @@ def _press_both(matrix: list[Array], wanted: Points, yields: Points, there: list
     )
 
 
-def measure_speeds(velocity: Velocity, groups: Groups, contacts: Contacts) -> Impulses:
-    """How fast b moves away from a along the tangent of every contact, and along its normal at both points [m/s]."""
-    return measure_several((velocity,), groups, contacts)[0]
-
-
-def measure_several(velocities: tuple[Velocity, ...], groups: Groups, contacts: Contacts) -> tuple[Impulses, ...]:
-    """The same of several velocities, with the contacts read once."""
-
-    def measure(group: tuple) -> tuple[Impulses, ...]:
-        (a, b), contacts = group
-        return tuple(_find_speeds((_pick_rows(each, a), _pick_rows(each, b)), contacts) for each in velocities)
-
-    return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
-
-
-def sum_impulses(contacts: Contacts, impulses: Impulses, incidence: Sides) -> Velocity:
-    """What impulses in groups change in the velocities of all bodies; `incidence` says which contacts each is a and b of."""
-    (on_a, on_b), (of_a, of_b) = incidence, _find_changes(contacts, impulses)
-    gather = lambda matrix, part: jnp.dot(matrix, part.reshape(-1, part.shape[-1]), precision=lax.Precision.HIGHEST)  # noqa: E731
-    return map_components(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
-
-
-__all__ = [
-    "SOFT",
-    "Contacts",
-    "Demand",
-    "Impulses",
-    "Velocity",
-    "build_contacts",
-    "map_components",
-    "measure_several",
-    "measure_speeds",
-    "sum_impulses",
-    "sweep_contacts",
-]
+__all__ = ["Contacts", "build_contacts", "find_changes", "find_speeds", "solve_contact"]

@@ -1,7 +1,7 @@
-"""Solids in the plane: bodies that may not pass each other, nor surfaces, with restitution and friction."""
+"""Solids, in the plane and in space: bodies that may not pass each other, nor surfaces, with restitution and friction."""
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,11 +14,14 @@ from physjax.parts import Contact
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.contacts.surface import Surface
 from physjax.physics.rigid.planar.bodies import PlanarBodies
-from physjax.physics.rigid.planar.pairs import group_contacts, list_pairs
-from physjax.physics.rigid.planar.response import solve_contacts
+from physjax.physics.rigid.planar.mechanics import PLANE
 from physjax.physics.rigid.planar.shapes import PlanarShape
-from physjax.physics.rigid.planar.surfaces import list_slots
-from physjax.physics.rigid.planar_inertia import PlanarInertia
+from physjax.physics.rigid.solids.mechanics import Mechanics
+from physjax.physics.rigid.solids.pairs import group_contacts, list_pairs
+from physjax.physics.rigid.solids.response import solve_contacts
+from physjax.physics.rigid.space.mechanics import SPACE
+from physjax.physics.rigid.space.shapes import Shape
+from physjax.physics.rigid.spatial import RigidBodies
 from physjax.quantities import collect_numbers
 from physjax.scene import Scene
 
@@ -27,9 +30,10 @@ SUBSTEPS = 4
 
 
 class Solids(Contact):
-    """Bodies in the plane that may not pass each other or the surfaces, with restitution K_r and Coulomb's friction.
+    """Bodies that may not pass each other or the surfaces, in the plane or in space, with restitution K_r and Coulomb's friction.
 
-    `shapes` is one for all bodies, or a sequence with one for each in the last lane axis; `surfaces` are those of `contacts`,
+    `shapes` is one for all bodies, or a sequence with one for each in the last lane axis: `rigid.PlanarShape` in the plane,
+    `rigid.Shape` in space. `surfaces` are those of `contacts`,
     with a restitution and friction of their own. Between bodies it is the mean of the two where `restitution` is given for
     each. `pairs`, `(pairs, 2)`, lists those that can touch: without, all pairs, of up to 64 bodies.
 
@@ -56,7 +60,7 @@ class Solids(Contact):
 
     couples: ClassVar[bool] = True
     memory: ClassVar[tuple[str, ...]] = ("impulses",)
-    shapes: tuple[PlanarShape, ...]
+    shapes: tuple[PlanarShape, ...] | tuple[Shape, ...]
     surfaces: tuple[Surface, ...]
     coulomb: Coulomb | None
     pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)
@@ -66,7 +70,7 @@ class Solids(Contact):
 
     def __init__(
         self,
-        shapes: PlanarShape | Sequence[PlanarShape],
+        shapes: PlanarShape | Shape | Sequence[PlanarShape] | Sequence[Shape],
         surfaces: Sequence[Surface] = (),
         restitution: ArrayLike = 0.0,
         coulomb: Coulomb | None = None,
@@ -74,7 +78,7 @@ class Solids(Contact):
         pairs: NestedArrayLike | None = None,
         substeps: int = SUBSTEPS,
     ):
-        self.shapes = (shapes,) if isinstance(shapes, PlanarShape) else tuple(shapes)
+        self.shapes = (shapes,) if isinstance(shapes, PlanarShape | Shape) else tuple(shapes)
         self.surfaces = tuple(surfaces)
         self.restitution = restitution
         self.coulomb = coulomb
@@ -83,8 +87,12 @@ class Solids(Contact):
         self.impulses = None
 
     def __check_init__(self):
+        in_space = bool(self.shapes) and isinstance(self.shapes[0], Shape)
+        of_shapes = (
+            (Shape, "rigid.Shape.box((1, 1, 1))") if in_space else (PlanarShape, "rigid.PlanarShape.box((1, 1))")
+        )
         for parts, kind, example in (
-            (self.shapes, PlanarShape, "rigid.PlanarShape.box((1, 1))"),
+            (self.shapes, *of_shapes),
             (self.surfaces, Surface, "contacts.Plane((0, 0), (0, 1))"),
         ):
             for part in parts:
@@ -108,20 +116,30 @@ class Solids(Contact):
         """How its contacts are resolved."""
         return solve_contacts
 
-    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes 2"]) -> Float[Array, "*lanes"]:
+    @property
+    def mechanics(self) -> Mechanics:
+        """That of the plane or of space, by the shapes."""
+        return SPACE if isinstance(self.shapes[0], Shape) else PLANE
+
+    def signed_distance(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes"]:
         """Infinite: how far shapes are apart depends on their angles as well."""
         return jnp.full(position.shape[:-1], jnp.inf)
 
-    def respond(self, t: ArrayLike, state: PlanarBodies) -> PlanarBodies:
+    def respond(self, t: ArrayLike, state: Any) -> Any:
         """The bodies as they are: contacts are resolved within the step."""
         return state
 
     def demand_fit(self, state: object, mass: object) -> None:
-        """Raise a TypeError unless the state is of bodies in the plane, a ValueError unless there is a shape for each."""
-        if not isinstance(state, PlanarBodies) or not isinstance(mass, PlanarInertia):
+        """Raise a TypeError unless the state is of bodies like the shapes, a ValueError unless there is a shape for each."""
+        flat = self.mechanics is PLANE
+        if not isinstance(state, PlanarBodies if flat else RigidBodies):
+            example = "PlanarBodies: rigid.planar_bodies(...)" if flat else "RigidBodies: rigid.bodies(...)"
             raise TypeError(
-                f"Solids: got a state of type {type(state).__name__}, expected PlanarBodies: rigid.planar_bodies(...)."
+                f"Solids: got a state of type {type(state).__name__} with shapes of type {type(self.shapes[0]).__name__}, "
+                f"expected {example}."
             )
+        if not flat and getattr(mass, "arm", None) is not None:
+            raise ValueError("Solids: got bodies on a pivot, expected free ones: hold them with rigid.Joints instead.")
         if not state.lanes:
             raise ValueError("Solids: got a single body without a lane axis, expected bodies in the last one.")
         if len(self.shapes) not in (1, state.lanes[-1]):
@@ -129,7 +147,7 @@ class Solids(Contact):
                 f"Solids: got {len(self.shapes)} shapes for {state.lanes[-1]} bodies, expected one for all or one for each."
             )
         for number in collect_numbers((self.surfaces, self.coulomb))[0]:
-            if number.has_lanes(state.lanes, 2):
+            if number.has_lanes(state.lanes, state.position.shape[-1]):
                 raise ValueError(
                     f"Solids: got {number.field} of {type(number.owner).__name__} for each of the lanes {state.lanes}, expected "
                     "one for all: a surface and Coulomb's friction are the same for all bodies and worlds."
@@ -139,12 +157,12 @@ class Solids(Contact):
                 f"Solids: got restitution of shape {self.restitution.shape}, expected () or {state.lanes[-1:]}."
             )
 
-    def prepare(self, state: PlanarBodies, couples: bool) -> "Solids":
+    def prepare(self, state: Any, couples: bool) -> "Solids":
         """The contact with its pairs listed and no impulses yet."""
         bodies = state.lanes[-1]
         pairs = list_pairs(self.pairs, bodies)
-        groups = group_contacts(pairs, len(list_slots(self.surfaces)), bodies)
-        none = jnp.zeros((*state.lanes[:-1], 3, *groups.contact.shape), state.dtype)
+        groups = group_contacts(pairs, len(self.mechanics.list_slots(self.surfaces, self.shapes)), bodies)
+        none = jnp.zeros((*state.lanes[:-1], self.mechanics.remembered, *groups.contact.shape), state.dtype)
         parts = self.shapes, self.surfaces, self.restitution, self.coulomb
         listed = Solids(*parts, pairs=pairs, substeps=self.substeps)
         return eqx.tree_at(lambda solids: solids.impulses, listed, none, is_leaf=lambda leaf: leaf is None)

@@ -8,8 +8,8 @@ All touching points at once would send a cradle off as (-0.6, 0.4, 0.4, 0.4, 0.4
 wrong.
 """
 
-from functools import partial
-from typing import NamedTuple
+from functools import partial, reduce
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,17 +17,18 @@ from jaxtyping import Array
 
 from physjax.compaction import choose_group_worlds
 from physjax.loops import differentiable_while_loop
-from physjax.physics.rigid.planar.impulses import (
-    Contacts,
+from physjax.physics.rigid.solids.mechanics import (
     Demand,
     Impulses,
+    Mechanics,
     Points,
     Velocity,
+    by_world,
+    find_largest,
     map_components,
-    measure_speeds,
-    sweep_contacts,
 )
-from physjax.physics.rigid.planar.pairs import Groups
+from physjax.physics.rigid.solids.pairs import Groups
+from physjax.physics.rigid.solids.sweeps import measure_openings, sweep_contacts
 
 MAX_ROUNDS = 64
 """Most rounds of a sub-step: an impact goes through a row of this many bodies."""
@@ -53,11 +54,11 @@ class Bouncing(NamedTuple):
 
     restitution: Array
     slow: Array
-    reach: tuple[Array, Array]
+    reach: Points
 
 
 class _Scene(NamedTuple):
-    contacts: Contacts
+    contacts: Any
     bouncing: Bouncing
 
 
@@ -76,20 +77,28 @@ class _Round(NamedTuple):
 
 
 def resolve_impacts(
-    velocity: Velocity, speeds: Points, groups: Groups, contacts: Contacts, bouncing: Bouncing
+    mechanics: Mechanics,
+    bodies: tuple[Velocity, Impulses],
+    openings: Points,
+    groups: Groups,
+    contacts: Any,
+    bouncing: Bouncing,
 ) -> Velocity:
-    """Velocities of all rows after the impacts; `speeds` are those of both points of each contact before [m/s].
+    """Velocities of all rows after the impacts; `openings` are the speeds of separation of all points before [m/s].
+
+    Of `bodies` the impulses only tell what those of contacts look like: there are none before.
 
     One loop over sweeps, in which each world begins its next round when its sweeps have converged. Of many worlds only
     those are swept that still bounce, some at a time: most have come to an end when the last has hundreds to go.
     """
-    scene, none = _Scene(contacts, bouncing), jnp.zeros_like(speeds[0])
+    (velocity, held), scene = bodies, _Scene(contacts, bouncing)
     worlds = velocity[0].shape[-1]
     zero = jnp.zeros(worlds, jnp.int32)
-    start = _Round(velocity, (none, none, none), *_find_demand(scene, velocity, speeds), zero, zero)
+    still = jax.tree.map(jnp.zeros_like, held)
+    start = _Round(velocity, still, *_find_demand(mechanics, scene, velocity, openings), zero, zero)
     some = choose_group_worlds(worlds)
     if some is None:
-        sweep = partial(_sweep, groups, scene)
+        sweep = partial(_sweep, mechanics, groups, scene)
         return differentiable_while_loop(
             _is_going, sweep, start, most=MAX_SWEEPS_WITH_DERIVATIVES, lanes_last=True
         ).velocity
@@ -100,7 +109,7 @@ def resolve_impacts(
         few, scene_of_few = jax.tree.map(pick, (all_worlds, scene))
         begun = few, jnp.zeros(some, jnp.int32)
         going = lambda turn: _is_going(turn[0]) & (turn[1] < SWEEPS_AT_A_TIME)  # noqa: E731
-        sweep = lambda turn: (_sweep(groups, scene_of_few, turn[0]), turn[1] + 1)  # noqa: E731
+        sweep = lambda turn: (_sweep(mechanics, groups, scene_of_few, turn[0]), turn[1] + 1)  # noqa: E731
         few, _ = differentiable_while_loop(going, sweep, begun, most=SWEEPS_AT_A_TIME, lanes_last=True)
         write = lambda leaf, new: leaf.at[..., index].set(new, unique_indices=True)  # noqa: E731
         return jax.tree.map(write, all_worlds, few)
@@ -110,44 +119,46 @@ def resolve_impacts(
 
 
 def _is_going(this: _Round) -> Array:
-    return jnp.any(this.active[0] | this.active[1], axis=(0, 1)) & (this.round < MAX_ROUNDS)
+    acts = reduce(jnp.logical_or, this.active)
+    return jnp.any(acts, axis=tuple(range(acts.ndim - 1))) & (this.round < MAX_ROUNDS)
 
 
-def _find_demand(scene: _Scene, velocity: Velocity, speeds: Points) -> tuple[Points, Points]:
-    """What the next round asks for: the speeds after it, and of which points."""
-    (contacts, bouncing), rounding = scene, _round_speed(velocity, ROUNDING)[None, None]
-    slow, found = bouncing.slow[None, None], []
-    for there, v, reach in zip(contacts.is_point, speeds, bouncing.reach, strict=True):
-        back = -bouncing.restitution * v
+def _find_demand(mechanics: Mechanics, scene: _Scene, velocity: Velocity, openings: Points) -> tuple[Points, Points]:
+    """What the next round asks for: the speeds after it, and of which points; of none in worlds that have what is asked."""
+    contacts, bouncing = scene
+    restitution, found = jax.vmap(mechanics.spread)(bouncing.restitution), []
+    rounding = _round_speed(mechanics, velocity, ROUNDING)
+    fast = bouncing.slow + rounding
+    for there, v, reach in zip(contacts.is_point, openings, bouncing.reach, strict=True):
+        back = -restitution * v
         # what has closed its gap already closes it no further
-        after = jnp.where(back > slow, back, -jnp.maximum(reach, 0.0))
-        found.append((after, there & (-v > slow + rounding) & (-v * REACH > reach)))
-    (first, first_acts), (second, second_acts) = found
-    return (first, second), (first_acts, second_acts)
+        after = jnp.where(back > by_world(bouncing.slow, v), back, -jnp.maximum(reach, 0.0))
+        acts = there & (-v > by_world(fast, v)) & (-v * REACH > reach)
+        found.append((after, acts, acts & (after > v + by_world(rounding, v))))
+    lacks = find_largest([lacking for _, _, lacking in found])
+    return tuple(speed for speed, _, _ in found), tuple(acts & by_world(lacks, acts) for _, acts, _ in found)
 
 
-def _sweep(groups: Groups, scene: _Scene, this: _Round) -> _Round:
+def _sweep(mechanics: Mechanics, groups: Groups, scene: _Scene, this: _Round) -> _Round:
     """One sweep further; a world whose sweeps have converged is at the beginning of its next round."""
     contacts, demand = scene.contacts, Demand.hard(this.speeds, this.active)
-    velocity, impulses = sweep_contacts(this.velocity, groups, contacts, demand, this.impulses)
-    moved = map_components(lambda new, old: jnp.abs(new - old), impulses, this.impulses)
+    velocity, impulses = sweep_contacts(mechanics, this.velocity, groups, contacts, demand, this.impulses)
+    moved = jax.vmap(mechanics.measure_size)(map_components(jnp.subtract, impulses, this.impulses), contacts)
     # an impulse changes the speed of a contact by at least that much
-    lightness = contacts.mass[0] + contacts.mass[1]
-    change = jnp.max(lightness * jnp.maximum(jnp.maximum(*moved[:2]), moved[2]), axis=(0, 1))
-    ends = (change <= _round_speed(velocity, CONVERGED)) | (this.sweep >= MAX_SWEEPS)
-    _, *opening = measure_speeds(velocity, groups, contacts)
-    following = _find_demand(scene, velocity, (opening[0], opening[1]))
-    begin = lambda new, old: jnp.where(ends[None, None], new, old)  # noqa: E731
+    change = find_largest([(contacts.mass[0] + contacts.mass[1]) * moved])
+    ends = (change <= _round_speed(mechanics, velocity, CONVERGED)) | (this.sweep >= MAX_SWEEPS)
+    following = _find_demand(mechanics, scene, velocity, measure_openings(mechanics, velocity, groups, contacts))
+    begin = lambda new, old: jnp.where(by_world(ends, old), new, old)  # noqa: E731
     speeds, active = jax.tree.map(begin, following, (this.speeds, this.active))
     impulses = map_components(lambda part: begin(0.0, part), impulses)
     rounds, sweeps = this.round + ends.astype(jnp.int32), jnp.where(ends, 0, this.sweep + 1)
     return _Round(velocity, impulses, speeds, active, rounds, sweeps)
 
 
-def _round_speed(velocity: Velocity, units: int) -> Array:
+def _round_speed(mechanics: Mechanics, velocity: Velocity, units: int) -> Array:
     """`units` of rounding of the fastest body of each world [m/s]."""
-    x, y, _ = velocity
-    return units * float(jnp.finfo(x.dtype).eps) * jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(y)), axis=0)
+    straight = [jnp.abs(part) for part in velocity[: mechanics.straight]]
+    return units * float(jnp.finfo(straight[0].dtype).eps) * find_largest(straight)
 
 
 __all__ = ["ROUNDING", "Bouncing", "resolve_impacts"]

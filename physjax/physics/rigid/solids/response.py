@@ -1,0 +1,178 @@
+"""A step of bodies that touch: sub-steps in which they move freely, bounce, and are held apart.
+
+Worlds are the last axis of every array here, so that one contact of all worlds is one stretch of memory: contacts are
+solved one group after the other, all worlds at the same time.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from physjax.loops import Time, to_float_time
+from physjax.physics.rigid.solids.impacts import ROUNDING, Bouncing, resolve_impacts
+from physjax.physics.rigid.solids.mechanics import (
+    SOFT,
+    Demand,
+    Impulses,
+    Kept,
+    Points,
+    Speeds,
+    Touching,
+    Velocity,
+    by_world,
+    find_largest,
+    map_components,
+)
+from physjax.physics.rigid.solids.sweeps import measure_openings, measure_several, sum_impulses, sweep_contacts
+from physjax.physics.rigid.solids.world import World, build_world
+from physjax.scene import Scene
+
+Motion = Callable[..., Scene]
+REST_SPEED_STEPS = 2.0
+"""What forces change in any speed within as many sub-steps is no impact: what approaches slower than that stays."""
+
+FRICTION_LEARNED = 0.1
+"""Share by which the friction that is kept follows that in the mean: without, boxes of a pyramid creep by 1.5 mm/s for ever,
+with velocities of zero at the ends of sub-steps. Normal impulses that follow make towers sway more and more."""
+
+
+def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scene:
+    """The scene after a step of dt in sub-steps, each of them: the method's own step, impacts, and impulses at contacts."""
+    number, *others = (i for i, contact in enumerate(scene.contacts) if contact.response is solve_contacts)
+    if others:
+        raise ValueError(
+            f"contacts: got {1 + len(others)} Solids, expected one: it holds all bodies, shapes= one for each, and all surfaces."
+        )
+    solids: Any = scene.contacts[number]
+    world = build_world(solids, scene)
+    dt = jnp.asarray(dt, scene.state.dtype)
+    h = dt / solids.substeps
+    memory = jnp.moveaxis(solids.impulses.reshape(-1, *solids.impulses.shape[-3:]), 0, -1)
+
+    def take(carry: tuple[Any, Kept], substep: Array) -> tuple[tuple[Any, Kept], None]:
+        state, kept = carry
+        start = t + substep.astype(h.dtype) * h
+        moved = motion(scene.replace(state=state), start, h).state
+        return _take_substep(world, scene, (state, moved), kept, to_float_time(start), h), None
+
+    begun, substeps = (scene.state, world.mechanics.unpack(memory)), jnp.arange(solids.substeps, dtype=jnp.int32)
+    (state, kept), _ = lax.scan(jax.checkpoint(take, prevent_cse=False), begun, substeps)
+    after = jnp.moveaxis(world.mechanics.pack(kept), -1, 0).reshape(solids.impulses.shape)
+    contacts = list(scene.contacts)
+    contacts[number] = eqx.tree_at(lambda solids: solids.impulses, solids, after)
+    return scene.replace(state=state, contacts=tuple(contacts))
+
+
+def _take_substep(
+    world: World, scene: Scene, states: tuple[Any, Any], kept: Kept, t: ArrayLike, h: Array
+) -> tuple[Any, Kept]:
+    """What a sub-step carries on, given the state at its start and where the method alone would bring it."""
+    mechanics = world.mechanics
+    # the step of each world, as a row
+    h = jnp.broadcast_to(h.reshape(1, -1), (1, world.worlds))
+    start, moved = (mechanics.read_pose(state, scene) for state in states)
+    touching = mechanics.find_contacts(world, start.place, t)
+    free = mean, end = mechanics.find_mean_rate(start, moved, h), moved.rate
+    changes = map_components(lambda now, after: jnp.abs(after - now), start.rate, end)
+    slow = REST_SPEED_STEPS * find_largest(changes[: mechanics.straight])
+    before = world.pad_all(start.rate)
+    speeds = measure_several(mechanics, (before, world.pad_all(mean)), world.groups, touching.contacts)
+    touching = _stick(world, touching, speeds[0], start.rate, slow)
+    held = jax.vmap(mechanics.recall)(kept, touching.contacts)
+    bounced = world.cut_all(_bounce(world, touching, (before, held), speeds, slow, h))
+    impact = map_components(jnp.subtract, bounced, start.rate)
+    bounced = map_components(jnp.add, mean, impact), map_components(jnp.add, end, impact)
+    moves, impulses = _hold_apart(world, touching, bounced, held, h)
+    places, rates = (map_components(jnp.subtract, after, before) for after, before in zip(moves, free, strict=True))
+    state = mechanics.write_pose(states, map_components(lambda part: by_world(h[0], part) * part, places), rates, scene)
+    return state, jax.vmap(mechanics.keep)(impulses, touching.contacts)
+
+
+def _stick(world: World, touching: Touching, speeds: Speeds, rate: Velocity, slow: Array) -> Touching:
+    """The contacts with static friction where they do not slip, or so slowly that forces may have just begun it."""
+    contacts, rounding = touching.contacts, ROUNDING * float(jnp.finfo(slow.dtype).eps)
+    slip = jax.vmap(world.mechanics.find_slip)(speeds, contacts)
+    fastest = find_largest([jnp.abs(part) for part in rate[: world.mechanics.straight]])
+    sticks = slip <= by_world(slow + rounding * fastest, slip)
+    return touching._replace(
+        contacts=contacts._replace(friction=jnp.where(sticks, world.materials.static, contacts.friction))
+    )
+
+
+class _Pass(NamedTuple):
+    """What a sweep starts with, and what it is asked for."""
+
+    velocity: Velocity
+    impulses: Impulses
+    demand: Demand
+
+
+def _hold_apart(
+    world: World, touching: Touching, velocities: tuple[Velocity, Velocity], held: Impulses, h: Array
+) -> tuple[tuple[Velocity, Velocity], Impulses]:
+    """The mean velocities and those at the end after contacts have acted, and what is kept of their impulses.
+
+    Two passes of one and the same sweep: the first finds the mean velocities, in which gaps must not close nor overlaps
+    stay; the second those at the end, with which nothing that touches may approach. What is kept is by how much the impulses
+    at the end are more than those in the mean: that is half of what a constant force needs, and none of what stops a motion
+    once, which both have in common. It is what the next sub-step starts with; its impulses at the end start with those that
+    it has found in the mean. So errors of a sweep do not feed on themselves; friction alone follows that of the mean a little.
+    """
+    (mean, end), (contacts, gap, _), mechanics = velocities, touching, world.mechanics
+    push = sum_impulses(mechanics, contacts, held, world.incidence)
+    each, rubbing = by_world(h[0], gap[0]), mechanics.rubbing
+
+    def sweep(this: _Pass, _: Any) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
+        start = world.pad_all(this.velocity)
+        after, pressed = sweep_contacts(mechanics, start, world.groups, contacts, this.demand, this.impulses)
+        opening = measure_openings(mechanics, after, world.groups, contacts)
+        cases = zip(contacts.is_point, pressed[rubbing:], gap, opening, strict=True)
+        touches = tuple(is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
+        after = world.cut_all(after)
+        # the impulses in the mean act on the end as well
+        ahead = map_components(lambda a, e, m, p: a + (e - m) + p, after, end, mean, push)
+        doubled = map_components(jnp.add, held, pressed)
+        still = tuple(jnp.zeros_like(s) for s in gap)
+        return _Pass(ahead, doubled, Demand.hard(still, touches)), (after, pressed, touches)
+
+    overlaps = tuple(s <= 0 for s in gap)
+    cure = tuple(jnp.where(over, -SOFT.cure * s, -s) / each for over, s in zip(overlaps, gap, strict=True))
+    start = _Pass(map_components(jnp.add, mean, push), held, Demand(cure, overlaps, contacts.is_point))
+    _, (rates, impulses, touches) = lax.scan(sweep, start, length=2)
+    moves, stops = (map_components(lambda part, k=k: part[k], rates) for k in range(2))
+    first = tuple(active[0] for active in touches)
+    keep = lambda stay, impulse: jnp.where(stay, impulse[1] - impulse[0], 0.0)  # noqa: E731
+    anywhere = jax.vmap(mechanics.find_any)(first)
+    grip = [
+        keep(anywhere, impulse) + jnp.where(anywhere, FRICTION_LEARNED * (impulse[0] - was), 0.0)
+        for impulse, was in zip(impulses[:rubbing], held[:rubbing], strict=True)
+    ]
+    return (moves, stops), (*grip, *map(keep, first, impulses[rubbing:]))
+
+
+def _bounce(
+    world: World,
+    touching: Touching,
+    bodies: tuple[Velocity, Impulses],
+    speeds: tuple[Speeds, ...],
+    slow: Array,
+    h: Array,
+) -> Velocity:
+    """Velocities at the start of a sub-step after the impacts of all that would reach each other in it.
+
+    `speeds` of contacts are those at the start and the mean ones.
+    """
+    now, middle = (jax.vmap(world.mechanics.find_openings)(each, touching.contacts) for each in speeds)
+    # forces change by `u - v` how fast the gap closes
+    reach = tuple(s / by_world(h[0], s) + (u - v) for s, u, v in zip(touching.gap, middle, now, strict=True))
+    bouncing = Bouncing(world.materials.restitution, slow, reach)
+    return resolve_impacts(world.mechanics, bodies, now, world.groups, touching.contacts, bouncing)
+
+
+__all__ = ["solve_contacts"]

@@ -1,0 +1,97 @@
+"""Where bodies in space touch: contacts with each other and with surfaces, in the groups in which they are solved."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from physjax.backend import materialise
+from physjax.physics.rigid.solids.mechanics import Sides, Touching
+from physjax.physics.rigid.solids.world import World
+from physjax.physics.rigid.space.boxes import find_box_manifolds
+from physjax.physics.rigid.space.impulses import Bodies, build_contacts
+from physjax.physics.rigid.space.manifolds import Boxes, Manifold
+from physjax.physics.rigid.space.segments import find_segment_manifolds
+from physjax.physics.rigid.space.shapes import tabulate_shapes
+from physjax.physics.rigid.space.surfaces import find_surface_manifolds
+from physjax.physics.rigid.space.turning import find_rotation
+
+
+def find_contacts(world: World, place: tuple[Array, ...], t: ArrayLike) -> Touching:
+    """All contacts of bodies at places `(3, bodies, worlds)` [m] with quaternions `(4, bodies, worlds)`, in groups."""
+    groups, (center, turn) = world.groups, place
+    matrix, turning = materialise(t, lambda: (find_rotation(turn), world.turning.find_mobility(turn)))
+    found = materialise(t, lambda: _find_groups(world, _place_shapes(world, center, matrix), t))
+
+    def take(part: Array) -> Sides:
+        padded = world.pad(part)
+        return padded[..., jnp.asarray(groups.a), :], padded[..., jnp.asarray(groups.b), :]
+
+    bodies = Bodies(take(center), world.mass, take(turning))
+    contacts = build_contacts(t, found, bodies, world.materials.carried, world.materials.kinetic)
+    return Touching(contacts, (jnp.moveaxis(found.gaps, 0, 1),), found.points)
+
+
+def _place_shapes(world: World, center: Array, matrix: Array) -> Boxes:
+    """The shapes of all bodies in the world, `(bodies, worlds)`."""
+    shapes = world.solids.shapes
+    table = tabulate_shapes(shapes if len(shapes) == world.size else shapes * world.size, world.dtype)
+    middle, axes = (center[0], center[1], center[2]), (matrix[0], matrix[1], matrix[2])
+    return Boxes(middle, axes, table.half[..., None], table.radius[:, None])
+
+
+def _find_groups(world: World, boxes: Boxes, t: ArrayLike) -> Manifold:
+    """Manifolds `(groups, size, worlds)`."""
+    groups, found = world.groups, []
+    arrange = lambda part: part.reshape(*part.shape[:-2], -1, groups.size, part.shape[-1])  # noqa: E731
+    if groups.of_pairs:
+        found.append(jax.tree.map(arrange, _find_pairs(world, boxes, t)))
+    if world.slots:
+        surfaces = materialise(t, lambda: find_surface_manifolds(world.slots, t, boxes))
+        found.append(jax.tree.map(partial(world.arrange_by_slot, arrange), surfaces))
+    normal, points, gaps, is_point = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-3), *found)
+    return Manifold(normal, points, gaps, is_point & jnp.asarray(groups.is_contact)[..., None])
+
+
+def _find_pairs(world: World, boxes: Boxes, t: ArrayLike) -> Manifold:
+    """The manifolds of all pairs, `(pairs, worlds)`: those of one kind together, and then in the order of the groups."""
+    groups, shapes = world.groups, world.solids.shapes
+    kinds = [shape.kind == "box" for shape in (shapes if len(shapes) == world.size else shapes * world.size)]
+    is_box = np.array(kinds)
+    a, b = (np.where(rows < world.size, rows, 0)[: groups.of_pairs].ravel() for rows in (groups.a, groups.b))
+    found, order = [], []
+    # boxes with boxes; what has no sides with what has, and with its like
+    for both in ((True, True), (True, False), (False, True), (False, False)):
+        chosen = np.flatnonzero((is_box[a] == both[0]) & (is_box[b] == both[1]))
+        if not len(chosen):
+            continue
+        first, second = _select(boxes, a[chosen], t), _select(boxes, b[chosen], t)
+        order.append(chosen)
+        if both == (True, True):
+            found.append(find_box_manifolds(t, first, second))
+        elif both == (False, True):
+            found.append(_turn_over(find_segment_manifolds(t, second, first, True)))
+        else:
+            found.append(find_segment_manifolds(t, first, second, both[0]))
+    if len(found) == 1:
+        return found[0]
+    places = np.argsort(np.concatenate(order))
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2)[..., places, :], *found)
+
+
+def _turn_over(found: Manifold) -> Manifold:
+    """The manifold of a and b, given that of b and a."""
+    x, y, z = found.normal
+    return found._replace(normal=(-x, -y, -z))
+
+
+def _select(boxes: Boxes, rows: np.ndarray, t: ArrayLike) -> Boxes:
+    x, y, z = (part[:, rows] for part in boxes.axes)
+    center = boxes.center[0][rows], boxes.center[1][rows], boxes.center[2][rows]
+    return materialise(t, lambda: Boxes(center, (x, y, z), boxes.half[:, rows], boxes.radius[rows]))
+
+
+__all__ = ["find_contacts"]
