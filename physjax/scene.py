@@ -51,7 +51,7 @@ from physjax.quantities import (
     may_hide_lanes,
 )
 from physjax.stages import Stage, advance_force, close_joints, prescribe, resolve_contact
-from physjax.summaries import describe_scene, write_summary, write_table
+from physjax.summaries import represent_scene, tabulate_scene
 from physjax.trials import find_faulty_force
 
 
@@ -127,7 +127,7 @@ class Scene(eqx.Module):
         self.forces = unify_gravity(forces, state.position.shape[-1])
         if emitter is not None and self.constraints:
             raise ValueError(
-                "Scene: got an emitter and joints, expected one of them: joined bodies live from the start. Leave one out."
+                "Scene: got an emitter and joints, expected one of them: joined bodies live from the start."
             )
         self.contacts = tuple(prepare_contact(contact, dtype) for contact in as_tuple("contact", contacts))
         for part in (*self.forces, *self.contacts):
@@ -145,12 +145,7 @@ class Scene(eqx.Module):
         self.reaction = None
         self.emitter = None if emitter is None else emitter.prepare(self)
 
-    def __repr__(self) -> str:
-        """What moves, and every part with its numbers and units."""
-        return write_summary(*describe_scene(self))
-
-    def _repr_html_(self) -> str:
-        return write_table(*describe_scene(self))
+    __repr__, _repr_html_ = represent_scene, tabulate_scene
 
     @property
     def couples(self) -> bool:

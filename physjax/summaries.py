@@ -154,6 +154,16 @@ def describe_scene(scene: Any) -> tuple[str, list[Row]]:
     return title, rows
 
 
+def represent_scene(self: Any) -> str:
+    """`describe_scene` as the `__repr__` of the class."""
+    return write_summary(*describe_scene(self))
+
+
+def tabulate_scene(self: Any) -> str:
+    """`describe_scene` as what a notebook shows."""
+    return write_table(*describe_scene(self))
+
+
 def count(number: int, one: str, many: str | None = None) -> str:
     """A number with its noun."""
     return f"{number} {one if number == 1 else many or one + 's'}"
@@ -167,6 +177,8 @@ __all__ = [
     "format_part",
     "format_tree",
     "represent_part",
+    "represent_scene",
+    "tabulate_scene",
     "write_grid",
     "write_summary",
     "write_table",

@@ -36,6 +36,7 @@ BOUNDS: dict[str, tuple[str, float, float]] = {
     "jump": ("m", 0.1, 5.0),
     "lean": ("rad", -0.7, 0.7),
     "length": ("m", 1e-3, 1e3),
+    "lift": ("rad", 0.0, 1.5),
     "links": ("", 2, 400),
     "mass": ("kg", 1e-6, LARGEST),
     "nodes": ("", 2, 200),
@@ -47,6 +48,7 @@ BOUNDS: dict[str, tuple[str, float, float]] = {
     "radius": ("m", 1e-4, 1e3),
     "rate": ("1/s", 1.0, 1e6),
     "ratio": ("", 0.01, 1e5),
+    "response_time": ("s", 0.05, 10.0),
     "restitution": ("", 0.0, 1.0),
     "rise": ("m/s", 0.0, 20.0),
     "rows": ("", 2, 200),
@@ -61,11 +63,13 @@ BOUNDS: dict[str, tuple[str, float, float]] = {
     "steepness": ("", 0.05, 1.5),
     "stiffness": ("N/m", 1e-3, LARGEST),
     "tilt": ("rad", 0.01, 3.1),
+    "torque": ("N m", 0.0, 1e4),
+    "travel": ("m", 0.1, 10.0),
     "wind": ("m/s", -100.0, 100.0),
     "wobble": ("rad/s", 0.0, 1e4),
 }
 """Unit, least and greatest value, by the name of the number."""
-OWN_UNITS = {"breaking_bridge.rate": "N/s"}
+OWN_UNITS = {"breaking_bridge.rate": "N/s", "motor_car.speed": "rad/s"}
 """Units that differ from those of the name, by scene."""
 OWN_RANGES = {
     "fire.rate": (50.0, 400.0),
