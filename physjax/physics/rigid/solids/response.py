@@ -14,6 +14,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from physjax.backend import materialise
 from physjax.loops import Time, to_float_time
 from physjax.physics.rigid.solids.impacts import ROUNDING, Bouncing, resolve_impacts
 from physjax.physics.rigid.solids.mechanics import (
@@ -76,7 +77,8 @@ def _take_substep(
     mechanics = world.mechanics
     # the step of each world, as a row
     h = jnp.broadcast_to(h.reshape(1, -1), (1, world.worlds))
-    start, moved = (mechanics.read_pose(state, scene) for state in states)
+    # stored with worlds last: what is only seen so would be read across memory by all that follows
+    start, moved = materialise(t, lambda: tuple(mechanics.read_pose(state, scene) for state in states))
     touching = mechanics.find_contacts(world, start.place, t)
     free = mean, end = mechanics.find_mean_rate(start, moved, h), moved.rate
     changes = map_components(lambda now, after: jnp.abs(after - now), start.rate, end)
@@ -84,7 +86,7 @@ def _take_substep(
     before = world.pad_all(start.rate)
     speeds = measure_several(mechanics, (before, world.pad_all(mean)), world.groups, touching.contacts)
     touching = _stick(world, touching, speeds[0], start.rate, slow)
-    held = jax.vmap(mechanics.recall)(kept, touching.contacts)
+    held = materialise(t, lambda: jax.vmap(mechanics.recall)(kept, touching.contacts))
     bounced = world.cut_all(_bounce(world, touching, (before, held), speeds, slow, h))
     impact = map_components(jnp.subtract, bounced, start.rate)
     bounced = map_components(jnp.add, mean, impact), map_components(jnp.add, end, impact)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from physjax.backend import block_fusion
 from physjax.physics.rigid.solids.mechanics import (
     Demand,
     Impulses,
@@ -34,7 +35,7 @@ def sweep_contacts(
     """
 
     def solve(velocity: Velocity, group: tuple) -> tuple[Velocity, Impulses]:
-        (a, b), contacts, demand, impulses = group
+        (a, b), contacts, demand, impulses = block_fusion(group)
         ends = _pick_rows(velocity, a), _pick_rows(velocity, b)
         new = mechanics.solve_contact(mechanics.find_speeds(ends, contacts), contacts, demand, impulses)
         change = mechanics.find_changes(contacts, map_components(jnp.subtract, new, impulses))

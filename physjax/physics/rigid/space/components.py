@@ -54,14 +54,14 @@ def combine(numbers: Array, vectors: Vector) -> Vector:
     return x, y, z
 
 
-def multiply(matrix: Array, vector: Array) -> Array:
-    """Matrices times vectors, `(3, 3, ...)` and `(3, ...)`."""
-    return matrix[:, 0] * vector[:1] + matrix[:, 1] * vector[1:2] + matrix[:, 2] * vector[2:]
+def multiply(matrix: Array, vector: Array | Sequence[Array]) -> Array:
+    """Matrices times vectors, `(3, 3, ...)` and three numbers."""
+    return matrix[:, 0] * vector[0][None] + matrix[:, 1] * vector[1][None] + matrix[:, 2] * vector[2][None]
 
 
-def multiply_back(matrix: Array, vector: Array) -> Array:
-    """Transposed matrices times vectors, `(3, 3, ...)` and `(3, ...)`."""
-    return matrix[0] * vector[:1] + matrix[1] * vector[1:2] + matrix[2] * vector[2:]
+def multiply_back(matrix: Array, vector: Array | Sequence[Array]) -> Array:
+    """Transposed matrices times vectors, `(3, 3, ...)` and three numbers."""
+    return matrix[0] * vector[0][None] + matrix[1] * vector[1][None] + matrix[2] * vector[2][None]
 
 
 def multiply_rows(a: Array, b: Array) -> Array:

@@ -9,13 +9,12 @@ point it is Coulomb's cone.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.backend import materialise
+from physjax.backend import block_fusion, materialise
 from physjax.physics.rigid.solids.mechanics import ALTERNATIONS, SOFT, Demand, Impulses, Points, Sides, Speeds, Velocity
 from physjax.physics.rigid.space.components import (
     Vector,
@@ -51,7 +50,7 @@ class Mobility(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """Both bodies of contacts in groups: centers of mass `(3, ...)` [m], 1/m [1/kg] and R I⁻¹ Rᵀ `(3, 3, ...)` [1/(kg m²)]."""
+    """Both bodies of contacts: centers of mass `(3, ...)` [m], 1/m [1/kg] and R I⁻¹ Rᵀ `(3, 3, ...)` [1/(kg m²)]."""
 
     center: Sides
     mass: Sides
@@ -81,7 +80,7 @@ class Contacts(NamedTuple):
 def build_contacts(
     t: ArrayLike, found: Manifold, bodies: Bodies, carried: tuple[Array, ...], friction: Array
 ) -> Contacts:
-    """Contacts of manifolds in groups, given the velocity of b's surface [m/s] and μ."""
+    """The contacts of manifolds, given the velocity of b's surface [m/s] and μ."""
     axes = materialise(t, lambda: find_tangents(found.normal))
     origin = [(part[0] + part[1] + part[2] + part[3]) / POINTS for part in found.points]
     middle = materialise(t, lambda: jnp.stack(origin))
@@ -94,11 +93,9 @@ def build_contacts(
     x, y, *arms = materialise(t, find_arms)
     swings = materialise(t, lambda: (_cross_rows(arms[0], axes), _cross_rows(arms[1], axes)))
     mobility = materialise(t, lambda: _find_mobility(axes, swings, bodies))
-    first = lambda part: jnp.moveaxis(part, -3, 0)  # noqa: E731
     speed = jnp.stack([axes[k, 0] * carried[0] + axes[k, 1] * carried[1] + axes[k, 2] * carried[2] for k in range(3)])
-    is_point = jnp.broadcast_to(found.is_point[:, None], (len(found.is_point), POINTS, *found.is_point.shape[1:]))
-    in_groups = jax.tree.map(first, (axes, swings, (x, y), speed, mobility))
-    return Contacts(*in_groups, bodies.mass, jax.tree.map(first, bodies.turning), friction, (is_point,))
+    is_point = jnp.broadcast_to(found.is_point, (POINTS, *found.is_point.shape))
+    return Contacts(axes, swings, (x, y), speed, mobility, bodies.mass, bodies.turning, friction, (is_point,))
 
 
 def _cross_rows(arm: Array, rows: Array) -> Array:
@@ -142,11 +139,10 @@ def find_slip(speeds: Speeds, contacts: Contacts) -> Array:
     return square_root(jnp.max(along * along + across * across, axis=0))
 
 
-def find_wrench(contacts: Contacts, impulses: Impulses) -> tuple[Array, Array]:
-    """The force and the torque about the origin of impulses, in the frame [N s, N m s], `(3, ...)`."""
-    (x, y), (friction, press) = contacts.places, impulses
-    force = jnp.stack([friction[0], friction[1], _sum(press)])
-    return force, jnp.stack([_sum(press * y), -_sum(press * x), friction[2]])
+def find_wrench(contacts: Contacts, impulses: Impulses) -> tuple[list[Array], list[Array]]:
+    """The force and the torque about the origin of impulses, in the frame [N s, N m s], by their three numbers."""
+    (x, y), (fx, fy, spin, press) = contacts.places, impulses
+    return block_fusion(([fx, fy, _sum(press)], [_sum(press * y), -_sum(press * x), spin]))
 
 
 def _sum(points: Array) -> Array:
@@ -180,26 +176,25 @@ def share_push(contacts: Contacts, push: Array, torque: Array) -> Array:
 
 def solve_contact(speeds: Speeds, contacts: Contacts, demand: Demand, impulses: Impulses) -> Impulses:
     """The impulses of each contact: all points that press together, then friction, in turns."""
-    (_, before), mobility = impulses, contacts.mobility
+    mobility, before = contacts.mobility, impulses[-1]
     velocity, spin = _find_twist(mobility, *find_wrench(contacts, impulses))
     # the twist there would be without any impulse
-    free = speeds[0] - velocity, speeds[1] - spin
-    there, matrix = contacts.is_point[0] & demand.active[0], _couple_points(contacts)
+    free, matrix = block_fusion(((speeds[0] - velocity, speeds[1] - spin), _couple_points(contacts)))
+    there, none = contacts.is_point[0] & demand.active[0], jnp.zeros_like(impulses[0])
 
-    def alternate(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        friction, _ = now
-        force, torque = find_wrench(contacts, (friction, jnp.zeros_like(before)))
-        velocity, spin = _find_twist(mobility, force, torque)
+    def alternate(now: Impulses, _: None) -> tuple[Impulses, None]:
+        fx, fy, turn, _ = now
+        velocity, spin = _find_twist(mobility, [fx, fy, none], [none, none, turn])
         opening = find_openings((free[0] + velocity, free[1] + spin), contacts)
         press = _press_points(matrix, demand.speed[0] - opening, demand.yields[0], there, before)
-        return (_grip(contacts, free, press), press), None
+        return (*_grip(contacts, free, press), press), None
 
-    now, _ = lax.scan(alternate, (impulses[0], before), length=ALTERNATIONS)
+    now, _ = lax.scan(alternate, impulses, length=ALTERNATIONS)
     return now
 
 
-def _find_twist(mobility: Mobility, force: Array, torque: Array) -> tuple[Array, Array]:
-    """What a force and a torque change in the twist, all `(3, ...)`."""
+def _find_twist(mobility: Mobility, force: list[Array], torque: list[Array]) -> tuple[Array, Array]:
+    """What a force and a torque change in the twist, `(3, ...)`."""
     velocity = multiply(mobility.straight, force) + multiply_back(mobility.mixed, torque)
     return velocity, multiply(mobility.mixed, force) + multiply(mobility.spin, torque)
 
@@ -233,7 +228,7 @@ def _press_points(matrix: Array, wanted: Array, yields: Array, there: Array, bef
     diagonal = jnp.where(yields, SOFT.yielding * own, own) + small * own
     system = _System(matrix, diagonal, wanted + small * own * before)
     pressed = _find_pressed(lax.stop_gradient(system), there)
-    return jnp.maximum(jnp.stack(_solve_pressed(system, pressed)), 0.0)
+    return jnp.maximum(jnp.stack(block_fusion(_solve_pressed(system, pressed))), 0.0)
 
 
 def _find_pressed(system: _System, there: Array) -> Array:
@@ -243,7 +238,7 @@ def _find_pressed(system: _System, there: Array) -> Array:
 
     def exchange(turn: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         number, pressed, _ = turn
-        x = jnp.stack(_solve_pressed(system, pressed))
+        x = jnp.stack(block_fusion(_solve_pressed(system, pressed)))
         # of points that do not press the diagonal is of no matter
         opening = _sum(jnp.swapaxes(system.matrix, 0, 1) * x[:, None]) - system.asked
         wrong = there & jnp.where(pressed, x < 0, opening < -floor[None])
@@ -275,21 +270,21 @@ def _solve_pressed(system: _System, pressed: Array) -> list[Array]:
     return x
 
 
-def _grip(contacts: Contacts, free: Speeds, press: Array) -> Array:
-    """What stops the slip, or as much of it as friction can: two forces, and the torque about the origin, `(3, ...)`."""
+def _grip(contacts: Contacts, free: Speeds, press: Array) -> tuple[Array, Array, Array]:
+    """What stops the slip, or as much of it as friction can: two forces, and the torque about the origin."""
     total, (x, y) = jnp.maximum(_sum(press), 0.0), contacts.places
     inverse = 1 / jnp.where(total > 0, total, jnp.inf)
     cx, cy = inverse * _sum(press * x), inverse * _sum(press * y)
     radius = inverse * _sum(press * square_root((x - cx[None]) ** 2 + (y - cy[None]) ** 2))
+    total, cx, cy, radius = block_fusion((total, cx, cy, radius))
     none = jnp.zeros_like(total)
-    torque = jnp.stack([total * cy, -total * cx, none])
-    velocity, spin = _find_twist(contacts.mobility, jnp.stack([none, none, total]), torque)
+    velocity, spin = _find_twist(contacts.mobility, [none, none, total], [total * cy, -total * cx, none])
     vx, vy, wz = free[0][0] + velocity[0], free[0][1] + velocity[1], free[1][2] + spin[2]
     # a force at the center turns about the origin
     slip = [vx - wz * cy, vy + wz * cx, radius * wz]
     matrix = _find_patch(contacts.mobility, (cx, cy, radius))
     fx, fy, twist = _slide(matrix, slip, contacts.friction * total)
-    return jnp.stack([fx, fy, radius * twist + cx * fy - cy * fx])
+    return fx, fy, radius * twist + cx * fy - cy * fx
 
 
 def _find_patch(mobility: Mobility, patch: Vector) -> list[list[Array]]:
@@ -332,7 +327,7 @@ def _slide(matrix: list[list[Array]], speeds: list[Array], most: Array) -> list[
     force = _solve_three(matrix, more, speeds)
     size = square_root(sum(part * part for part in force))
     share = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), jnp.where(most > 0, 1.0, 0.0))
-    return [-share * part for part in force]
+    return block_fusion([-share * part for part in force])
 
 
 def _solve_three(matrix: list[list[Array]], more: Array, right: list[Array]) -> list[Array]:

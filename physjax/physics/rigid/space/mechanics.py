@@ -1,8 +1,10 @@
 """The mechanics of solids in space: a body turns by a quaternion, and touches with four points in a plane."""
 
 from collections.abc import Sequence
+from functools import reduce
 
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -40,7 +42,7 @@ class SpatialMechanics(Mechanics):
     """
 
     remembered = 6
-    rubbing = 1
+    rubbing = 3
     straight = 1
 
     def read_pose(self, state: RigidBodies, scene: Scene) -> Pose:
@@ -106,16 +108,14 @@ class SpatialMechanics(Mechanics):
 
     def measure_size(self, impulses: Impulses, contacts: Contacts) -> Array:
         """The greatest part of the force, or of the torque over the distance of the points from the middle."""
-        (force, torque), (x, y) = impulses_of_contacts.find_wrench(contacts, impulses), contacts.places
+        (x, y), parts = contacts.places, impulses_of_contacts.find_wrench(contacts, impulses)
+        push, turn = (reduce(jnp.maximum, map(jnp.abs, part)) for part in parts)
         reach = jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(y)), axis=0)
-        turn = jnp.max(jnp.abs(torque), axis=0)
-        return jnp.maximum(
-            jnp.max(jnp.abs(force), axis=0), jnp.where(reach > 0, turn / jnp.where(reach > 0, reach, 1.0), 0.0)
-        )
+        return jnp.maximum(push, jnp.where(reach > 0, turn / jnp.where(reach > 0, reach, 1.0), 0.0))
 
     def find_any(self, points: Points) -> Array:
         """Whether any of four points is flagged."""
-        return jnp.any(points[0], axis=0, keepdims=True)
+        return jnp.any(points[0], axis=0)
 
     def spread(self, number: Array) -> Array:
         """The number with an axis of points in front."""
@@ -124,7 +124,7 @@ class SpatialMechanics(Mechanics):
     def recall(self, kept: Kept, contacts: Contacts) -> Impulses:
         """The impulses with the force and torque that were kept, shared among the points as evenly as can be."""
         force, torque = (multiply(contacts.axes, part) for part in kept)
-        return jnp.stack([force[0], force[1], torque[2]]), impulses_of_contacts.share_push(contacts, force[2], torque)
+        return force[0], force[1], torque[2], impulses_of_contacts.share_push(contacts, force[2], torque)
 
     def keep(self, impulses: Impulses, contacts: Contacts) -> Kept:
         """The force and the torque about the middle of the contact, in the world [N s, N m s]."""
@@ -141,8 +141,8 @@ class SpatialMechanics(Mechanics):
 
 
 def _by_body(array: Array) -> Array:
-    """An array of vectors `(*worlds, bodies, dim)` as `(dim, bodies, worlds)`."""
-    return jnp.transpose(array.reshape(-1, *array.shape[-2:]), (2, 1, 0))
+    """An array of vectors `(*worlds, bodies, dim)` as `(dim, bodies, worlds)`, in memory too: XLA would only see it so."""
+    return lax.map(jnp.transpose, jnp.moveaxis(array.reshape(-1, *array.shape[-2:]), -1, 0))
 
 
 def _find_rotation(angle: Sequence[Array]) -> list[Array]:

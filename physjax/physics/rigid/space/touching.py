@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -12,7 +13,7 @@ from physjax.backend import materialise
 from physjax.physics.rigid.solids.mechanics import Sides, Touching
 from physjax.physics.rigid.solids.world import World
 from physjax.physics.rigid.space.boxes import find_box_manifolds
-from physjax.physics.rigid.space.impulses import Bodies, build_contacts
+from physjax.physics.rigid.space.impulses import Bodies, Contacts, build_contacts
 from physjax.physics.rigid.space.manifolds import Boxes, Manifold
 from physjax.physics.rigid.space.segments import find_segment_manifolds
 from physjax.physics.rigid.space.shapes import tabulate_shapes
@@ -28,11 +29,19 @@ def find_contacts(world: World, place: tuple[Array, ...], t: ArrayLike) -> Touch
 
     def take(part: Array) -> Sides:
         padded = world.pad(part)
-        return padded[..., jnp.asarray(groups.a), :], padded[..., jnp.asarray(groups.b), :]
+        return first(padded[..., jnp.asarray(groups.a), :]), first(padded[..., jnp.asarray(groups.b), :])
 
+    first = lambda part: jnp.moveaxis(part, -3, 0)  # noqa: E731
+    of = world.materials
     bodies = Bodies(take(center), world.mass, take(turning))
-    contacts = build_contacts(t, found, bodies, world.materials.carried, world.materials.kinetic)
-    return Touching(contacts, (jnp.moveaxis(found.gaps, 0, 1),), found.points)
+
+    # one group after the other: so each is stored whole, as it is read when it is solved
+    def build(group: tuple) -> tuple[Contacts, Array]:
+        found, bodies, carried, friction = group
+        return build_contacts(t, found, bodies, carried, friction), found.gaps
+
+    contacts, gap = lax.map(build, (jax.tree.map(first, found), bodies, of.carried, of.kinetic))
+    return Touching(contacts, (gap,), found.points)
 
 
 def _place_shapes(world: World, center: Array, matrix: Array) -> Boxes:
