@@ -99,7 +99,11 @@ def find_planar_shapes(film: Trajectory) -> list[PlanarShape] | None:
     joints = [part for part in scene.constraints if isinstance(part, BodyJoints)]
     if not solids and not joints:
         return None
-    shapes = list(solids[0].shapes) if solids else [_build_bar(joints, body) for body in range(bodies)]
+    shapes = (
+        [shape for shape in solids[0].shapes if isinstance(shape, PlanarShape)]
+        if solids
+        else [_build_bar(joints, body) for body in range(bodies)]
+    )
     return (shapes * bodies if len(shapes) == 1 else shapes) * int(np.prod(worlds, dtype=int))
 
 

@@ -119,7 +119,7 @@ def _find_contacts(scene: Scene, solids: Solids, slots: list[Slot], t: ArrayLike
     return (
         arrange(contacts.normal),
         jnp.stack([arrange(x), arrange(y)], axis=-1),
-        arrange(gaps),
+        arrange((gaps[0], gaps[1])),
         arrange(contacts.is_point),
         jnp.swapaxes(held[..., 1:, :], -1, -2),
         held[..., 0, :],

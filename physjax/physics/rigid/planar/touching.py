@@ -27,8 +27,8 @@ def find_contacts(world: World, place: tuple[Array, ...], t: ArrayLike) -> Touch
     x, y = map(world.pad, place[:2])
     reach = lambda rows: (points[0] - x[rows][None], points[1] - y[rows][None])  # noqa: E731
     arm = reach(jnp.asarray(groups.a)), reach(jnp.asarray(groups.b))
-    of = world.materials
-    contacts = build_contacts(t, normal, arm, of.carried, (world.mass, world.turning), of.kinetic, is_point)
+    of, (along, across) = world.materials, world.materials.carried
+    contacts = build_contacts(t, normal, arm, (along, across), (world.mass, world.turning), of.kinetic, is_point)
     return Touching(contacts, (gaps[0], gaps[1]), points)
 
 

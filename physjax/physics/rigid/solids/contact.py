@@ -60,7 +60,7 @@ class Solids(Contact):
 
     couples: ClassVar[bool] = True
     memory: ClassVar[tuple[str, ...]] = ("impulses",)
-    shapes: tuple[PlanarShape, ...] | tuple[Shape, ...]
+    shapes: tuple[PlanarShape | Shape, ...]
     surfaces: tuple[Surface, ...]
     coulomb: Coulomb | None
     pairs: tuple[tuple[int, int], ...] | None = eqx.field(static=True)
@@ -70,7 +70,7 @@ class Solids(Contact):
 
     def __init__(
         self,
-        shapes: PlanarShape | Shape | Sequence[PlanarShape] | Sequence[Shape],
+        shapes: PlanarShape | Shape | Sequence[PlanarShape | Shape],
         surfaces: Sequence[Surface] = (),
         restitution: ArrayLike = 0.0,
         coulomb: Coulomb | None = None,
@@ -88,18 +88,19 @@ class Solids(Contact):
 
     def __check_init__(self):
         in_space = bool(self.shapes) and isinstance(self.shapes[0], Shape)
-        of_shapes = (
-            (Shape, "rigid.Shape.box((1, 1, 1))") if in_space else (PlanarShape, "rigid.PlanarShape.box((1, 1))")
-        )
-        for parts, kind, example in (
-            (self.shapes, *of_shapes),
-            (self.surfaces, Surface, "contacts.Plane((0, 0), (0, 1))"),
-        ):
-            for part in parts:
-                if not isinstance(part, kind):
-                    raise TypeError(
-                        f"Solids: got a {type(part).__name__}, expected a {kind.__name__} such as {example}."
-                    )
+        for shape in self.shapes:
+            if not isinstance(shape, Shape if in_space else PlanarShape):
+                example = (
+                    "Shape such as rigid.Shape.box((1, 1, 1))"
+                    if in_space
+                    else "PlanarShape such as rigid.PlanarShape.box((1, 1))"
+                )
+                raise TypeError(f"Solids: got a {type(shape).__name__}, expected a {example}.")
+        for surface in self.surfaces:
+            if not isinstance(surface, Surface):
+                raise TypeError(
+                    f"Solids: got a {type(surface).__name__}, expected a Surface such as contacts.Plane((0, 0), (0, 1))."
+                )
         for surface in self.surfaces:
             if surface.friction is not None or surface.response is not None:
                 raise ValueError(

@@ -26,6 +26,7 @@ from physjax.physics.rigid.space.components import (
     put_in_front,
     scale,
     subtract,
+    sum_parts,
     take_part,
     take_vector,
 )
@@ -95,7 +96,7 @@ def _find_axis(a: Boxes, b: Boxes, cosines: Array, ways: tuple[Array, Array]) ->
     on_b = abs(ways[1]) - b.half - (size[0] * a.half[:1] + size[1] * a.half[1:2] + size[2] * a.half[2:])
     best_a, best_b = find_best(on_a), find_best(on_b)
     edge, first, second = _find_edges(a.half, b.half, cosines, ways[0])
-    share = PARALLEL_SHARE * (sum(a.half) + sum(b.half))
+    share = PARALLEL_SHARE * (sum_parts(a.half) + sum_parts(b.half))
     prefers_a = best_a[0] >= best_b[0] - share
     of_edges = edge > jnp.maximum(best_a[0], best_b[0]) + share
     return _Axis(of_edges, prefers_a, jnp.where(prefers_a, best_a[1], best_b[1]), (first, second))

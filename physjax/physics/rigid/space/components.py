@@ -70,6 +70,14 @@ def multiply_rows(a: Array, b: Array) -> Array:
     return one[:, :, 0] * two[:, :, 0] + one[:, :, 1] * two[:, :, 1] + one[:, :, 2] * two[:, :, 2]
 
 
+def sum_parts(parts: Array | Sequence[Array]) -> Array:
+    """The sum of several numbers, one after the other."""
+    total = parts[0]
+    for number in range(1, len(parts)):
+        total = total + parts[number]
+    return total
+
+
 def take_part(index: Array, parts: Array | Sequence[Array]) -> Array:
     """The part with this number, of each lane: choices one after the other, which fuse where a gather would not."""
     found = parts[0]
@@ -118,6 +126,7 @@ __all__ = [
     "scale",
     "square_root",
     "subtract",
+    "sum_parts",
     "take_part",
     "take_vector",
 ]

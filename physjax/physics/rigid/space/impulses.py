@@ -7,7 +7,7 @@ ellipsoid by which S. Goyal (1991) and R. Howe and M. Cutkosky (1996) describe a
 point it is Coulomb's cone.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -22,6 +22,7 @@ from physjax.physics.rigid.space.components import (
     multiply_back,
     multiply_rows,
     square_root,
+    sum_parts,
 )
 from physjax.physics.rigid.space.manifolds import POINTS, Manifold, find_tangents
 
@@ -86,8 +87,8 @@ def build_contacts(
     middle = materialise(t, lambda: jnp.stack(origin))
 
     def find_arms() -> tuple[Array, Array, Array, Array]:
-        ways = found.points[0] - middle[0], found.points[1] - middle[1], found.points[2] - middle[2]
-        x, y = (axes[k, 0] * ways[0] + axes[k, 1] * ways[1] + axes[k, 2] * ways[2] for k in (0, 1))
+        ways = [part - start[None] for part, start in zip(found.points, middle, strict=True)]
+        x, y = (sum_parts([axes[k, i][None] * way for i, way in enumerate(ways)]) for k in (0, 1))
         return x, y, middle - bodies.center[0], middle - bodies.center[1]
 
     x, y, *arms = materialise(t, find_arms)
@@ -107,16 +108,17 @@ def _cross_rows(arm: Array, rows: Array) -> Array:
 
 def _find_mobility(axes: Array, swings: Sides, bodies: Bodies) -> Mobility:
     """What unit forces and torques along the axes change in the twist of b relative to a."""
-    both = zip(bodies.turning, swings, strict=True)
-    # what a force, and what a torque along each axis turns, as rows
-    turns = [(multiply_rows(swing, turning), multiply_rows(axes, turning), swing) for turning, swing in both]
-    straight = sum(multiply_rows(by_force, swing) for by_force, _, swing in turns)
-    total = bodies.mass[0] + bodies.mass[1]
-    diagonal = jnp.eye(3, dtype=total.dtype).reshape(3, 3, *(1,) * total.ndim)
-    mixed = sum(multiply_rows(by_torque, swing) for _, by_torque, swing in turns)
-    return Mobility(
-        straight + diagonal * total, mixed, sum(multiply_rows(by_torque, axes) for _, by_torque, _ in turns)
+    a, b = (
+        Mobility(
+            multiply_rows(multiply_rows(swing, turning), swing),
+            multiply_rows(multiply_rows(axes, turning), swing),
+            multiply_rows(multiply_rows(axes, turning), axes),
+        )
+        for turning, swing in zip(bodies.turning, swings, strict=True)
     )
+    total = (bodies.mass[0] + bodies.mass[1])[None, None]
+    diagonal = jnp.eye(3, dtype=total.dtype).reshape(3, 3, *(1,) * (total.ndim - 2))
+    return Mobility(a.straight + b.straight + diagonal * total, a.mixed + b.mixed, a.spin + b.spin)
 
 
 def find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Speeds:
@@ -142,11 +144,7 @@ def find_slip(speeds: Speeds, contacts: Contacts) -> Array:
 def find_wrench(contacts: Contacts, impulses: Impulses) -> tuple[list[Array], list[Array]]:
     """The force and the torque about the origin of impulses, in the frame [N s, N m s], by their three numbers."""
     (x, y), (fx, fy, spin, press) = contacts.places, impulses
-    return block_fusion(([fx, fy, _sum(press)], [_sum(press * y), -_sum(press * x), spin]))
-
-
-def _sum(points: Array) -> Array:
-    return points[0] + points[1] + points[2] + points[3]
+    return block_fusion(([fx, fy, sum_parts(press)], [sum_parts(press * y), -sum_parts(press * x), spin]))
 
 
 def find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
@@ -165,7 +163,7 @@ def share_push(contacts: Contacts, push: Array, torque: Array) -> Array:
     """The impulses of four points, as even as can be, of a normal one [N s] and torques about both tangents [N m s]."""
     xs, ys = contacts.places
     # about the middle of all points the sums of x and y are zero
-    xx, xy, yy = _sum(xs * xs), _sum(xs * ys), _sum(ys * ys)
+    xx, xy, yy = sum_parts(xs * xs), sum_parts(xs * ys), sum_parts(ys * ys)
     small = float(jnp.finfo(push.dtype).eps) ** 0.5 * (xx + yy)
     xx, yy = xx + small, yy + small
     area = xx * yy - xy * xy
@@ -182,8 +180,8 @@ def solve_contact(speeds: Speeds, contacts: Contacts, demand: Demand, impulses: 
     free, matrix = block_fusion(((speeds[0] - velocity, speeds[1] - spin), _couple_points(contacts)))
     there, none = contacts.is_point[0] & demand.active[0], jnp.zeros_like(impulses[0])
 
-    def alternate(now: Impulses, _: None) -> tuple[Impulses, None]:
-        fx, fy, turn, _ = now
+    def alternate(now: Impulses, _: Any) -> tuple[Impulses, None]:
+        fx, fy, turn, *_ = now
         velocity, spin = _find_twist(mobility, [fx, fy, none], [none, none, turn])
         opening = find_openings((free[0] + velocity, free[1] + spin), contacts)
         press = _press_points(matrix, demand.speed[0] - opening, demand.yields[0], there, before)
@@ -203,9 +201,11 @@ def _couple_points(contacts: Contacts) -> Array:
     """How much a unit impulse at one point opens another [1/kg], `(4, 4, ...)`."""
     (x, y), (straight, mixed, spin) = contacts.places, contacts.mobility
     x1, x2, y1, y2 = x[:, None], x[None], y[:, None], y[None]
+    one = lambda number: number[None, None]  # noqa: E731
     # along the normal a point moves by v_z + ω_x y - ω_y x
-    outer = straight[2, 2] + mixed[0, 2] * (y1 + y2) - mixed[1, 2] * (x1 + x2)
-    return outer + spin[0, 0] * y1 * y2 - spin[0, 1] * (y1 * x2 + x1 * y2) + spin[1, 1] * x1 * x2
+    outer = one(straight[2, 2]) + one(mixed[0, 2]) * (y1 + y2) - one(mixed[1, 2]) * (x1 + x2)
+    turned = one(spin[0, 0]) * y1 * y2 - one(spin[0, 1]) * (y1 * x2 + x1 * y2) + one(spin[1, 1]) * x1 * x2
+    return outer + turned
 
 
 class _System(NamedTuple):
@@ -234,15 +234,15 @@ def _press_points(matrix: Array, wanted: Array, yields: Array, there: Array, bef
 def _find_pressed(system: _System, there: Array) -> Array:
     """Which points press: by exchange of those that pull, and of those that would approach (K. Murty 1974)."""
     units = ROUNDING * float(jnp.finfo(system.asked.dtype).eps)
-    floor = units * _sum(abs(system.asked))
+    floor = units * sum_parts(abs(system.asked))
 
     def exchange(turn: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         number, pressed, _ = turn
         x = jnp.stack(block_fusion(_solve_pressed(system, pressed)))
         # of points that do not press the diagonal is of no matter
-        opening = _sum(jnp.swapaxes(system.matrix, 0, 1) * x[:, None]) - system.asked
+        opening = sum_parts(jnp.swapaxes(system.matrix, 0, 1) * x[:, None]) - system.asked
         wrong = there & jnp.where(pressed, x < 0, opening < -floor[None])
-        earlier = jnp.cumsum(wrong, axis=0, dtype=jnp.int32) - wrong
+        earlier = jnp.cumsum(wrong, axis=0, dtype=jnp.int32) - wrong.astype(jnp.int32)
         flips = wrong & ((earlier == 0) | (number < FULL_EXCHANGES))
         return number + 1, pressed ^ flips, jnp.any(wrong)
 
@@ -272,10 +272,10 @@ def _solve_pressed(system: _System, pressed: Array) -> list[Array]:
 
 def _grip(contacts: Contacts, free: Speeds, press: Array) -> tuple[Array, Array, Array]:
     """What stops the slip, or as much of it as friction can: two forces, and the torque about the origin."""
-    total, (x, y) = jnp.maximum(_sum(press), 0.0), contacts.places
+    total, (x, y) = jnp.maximum(sum_parts(press), 0.0), contacts.places
     inverse = 1 / jnp.where(total > 0, total, jnp.inf)
-    cx, cy = inverse * _sum(press * x), inverse * _sum(press * y)
-    radius = inverse * _sum(press * square_root((x - cx[None]) ** 2 + (y - cy[None]) ** 2))
+    cx, cy = inverse * sum_parts(press * x), inverse * sum_parts(press * y)
+    radius = inverse * sum_parts(press * square_root((x - cx[None]) ** 2 + (y - cy[None]) ** 2))
     total, cx, cy, radius = block_fusion((total, cx, cy, radius))
     none = jnp.zeros_like(total)
     velocity, spin = _find_twist(contacts.mobility, [none, none, total], [total * cy, -total * cx, none])
@@ -294,8 +294,8 @@ def _find_patch(mobility: Mobility, patch: Vector) -> list[list[Array]]:
     c, e, f = mobility.mixed[2, 0], mobility.mixed[2, 1], mobility.spin[2, 2]
     own = [[a, b, c], [b, d, e], [c, e, f]]
     ways = [(one, none, -cy), (none, one, cx), (none, none, radius)]
-    moved = [[sum(k * part for k, part in zip(row, way, strict=True)) for row in own] for way in ways]
-    matrix = [[sum(p * q for p, q in zip(way, other, strict=True)) for other in moved] for way in ways]
+    moved = [[sum_parts([k * part for k, part in zip(row, way, strict=True)]) for row in own] for way in ways]
+    matrix = [[sum_parts([p * q for p, q in zip(way, other, strict=True)]) for other in moved] for way in ways]
     # a single point resists no spin, and its radius may be one of rounding
     matrix[2][2] = matrix[2][2] + float(jnp.finfo(radius.dtype).eps) ** 0.5 * matrix[0][0]
     return matrix
@@ -310,22 +310,22 @@ def _slide(matrix: list[list[Array]], speeds: list[Array], most: Array) -> list[
     matrix = [
         [jnp.where(own > 0, k, 1.0 if i == j else 0.0) for j, k in enumerate(row)] for i, row in enumerate(matrix)
     ]
-    whole = square_root(sum(part * part for part in _solve_three(matrix, jnp.zeros_like(most), speeds)))
+    whole = square_root(sum_parts([part * part for part in _solve_three(matrix, jnp.zeros_like(most), speeds)]))
     # of less than that only the direction is left to find
     bound = jnp.maximum(most, LEAST_SHARE * whole)
     divisor = jnp.where(bound > 0, bound, 1.0)
 
     def turn(more: Array, _: None) -> tuple[Array, None]:
         force = _solve_three(matrix, more, speeds)
-        square = sum(part * part for part in force)
+        square = sum_parts([part * part for part in force])
         size = square_root(square)
-        bent = sum(part * other for part, other in zip(force, _solve_three(matrix, more, force), strict=True))
+        bent = sum_parts([part * other for part, other in zip(force, _solve_three(matrix, more, force), strict=True)])
         step = jnp.where(bent != 0, square / jnp.where(bent != 0, bent, 1.0), 0.0) * (size - bound) / divisor
         return jnp.where(size > bound, more + step, more), None
 
     more, _ = lax.scan(turn, jnp.zeros_like(most), length=SLIDE_TURNS)
     force = _solve_three(matrix, more, speeds)
-    size = square_root(sum(part * part for part in force))
+    size = square_root(sum_parts([part * part for part in force]))
     share = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), jnp.where(most > 0, 1.0, 0.0))
     return block_fusion([-share * part for part in force])
 

@@ -14,7 +14,15 @@ from jaxtyping import Array
 
 from physjax.backend import materialise
 from physjax.physics.rigid.space.boxes import clip_way
-from physjax.physics.rigid.space.components import add, combine, find_sign, put_in_front, square_root, take_part
+from physjax.physics.rigid.space.components import (
+    add,
+    combine,
+    find_sign,
+    put_in_front,
+    square_root,
+    sum_parts,
+    take_part,
+)
 from physjax.physics.rigid.space.manifolds import POINTS, Boxes, Frame, Manifold, see_direction
 
 LINE_SHARE = 1e-2
@@ -50,7 +58,7 @@ def find_segment_manifolds(t: ArrayLike, box: Boxes, other: Boxes, has_sides: bo
     # of a face the height above it, of an edge or corner that above its nearest point
     side = jnp.where(abs(direction) > 1 - INSIDE_SHARE, find_sign(direction), 0.0) * box.half[:, None]
     below = jnp.where(side == 0, jnp.clip(point, -box.half[:, None], box.half[:, None]), side)
-    heights = sum(direction * (point - below))
+    heights = sum_parts(direction * (point - below))
     gaps = heights - (box.radius + other.radius)[None]
     middle = point - (other.radius[None] + gaps / 2)[None] * direction
     axes = tuple(part[:, None] for part in frame.axes)
@@ -64,7 +72,7 @@ def _see_segment(frame: Frame, shape: Boxes) -> _Segment:
     """The segment within a ball or capsule, along the axis in which it has a length."""
     share = jnp.where(shape.half > 0, 1.0, 0.0).astype(shape.half.dtype)
     along = see_direction(frame.axes, combine(share, shape.axes))
-    return _Segment(frame.see(shape.center), along, sum(shape.half) + jnp.zeros_like(along[0]))
+    return _Segment(frame.see(shape.center), along, sum_parts(shape.half) + jnp.zeros_like(along[0]))
 
 
 def _find_way(point: Array, half: Array) -> Array:
@@ -74,7 +82,7 @@ def _find_way(point: Array, half: Array) -> Array:
 
 def _find_normal(way: Array, radius: Array) -> tuple[Array, Array]:
     """The direction from the box to the nearest point, and whether that is outside; two centers in one place part along x."""
-    distance = square_root(sum(way * way))
+    distance = square_root(sum_parts(way * way))
     apart = distance > INSIDE_SHARE * radius
     x = jnp.array([1.0, 0.0, 0.0], way.dtype).reshape(3, 1, 1)
     return jnp.where(apart[None], way / jnp.where(apart, distance, 1.0)[None], x), apart
@@ -87,7 +95,7 @@ def _find_line(segment: _Segment, box: Boxes, other: Boxes) -> Array:
     """
     sign = jnp.array([-1.0, 1.0], segment.half.dtype).reshape(2, 1, 1)
     level = LINE_SHARE * sign * (box.radius + other.radius)[None]
-    slope = lambda place: sum(segment.along[:, None] * _find_way(segment.at(place), box.half))  # noqa: E731
+    slope = lambda place: sum_parts(segment.along[:, None] * _find_way(segment.at(place), box.half))  # noqa: E731
     reach = segment.half[None]
     places = [-reach, reach]
     for middle, along, own in zip(segment.middle, segment.along, box.half, strict=True):
@@ -110,7 +118,7 @@ def _prefer_faces(
     """The normal, and the places along the segment at which it touches: of a face what lies above it."""
     apart, way, normal = nearest
     beyond = way != 0
-    over_face = apart & (sum(beyond.astype(jnp.int32)) == 1)
+    over_face = apart & (sum_parts(beyond.astype(jnp.int32)) == 1)
     # inside, the face that is nearest to all of the segment
     depths = abs(segment.middle) - half - segment.half[None] * abs(segment.along)
     first = lambda flags: jnp.where(flags[0], 0, jnp.where(flags[1], 1, 2))  # noqa: E731

@@ -23,14 +23,14 @@ class Shape(eqx.Module):
         ([1.0, 0.5, 2.0], 0.5)
     """
 
+    kind: Kind = eqx.field(static=True)
     half: Float[Array, "3"] = unchecked_quantity("half edges", "m", per=None)
     radius: Numbers = unchecked_quantity("radius", "m", per=None, at_least=0)
-    kind: Kind = eqx.field(static=True)
 
     @classmethod
     def sphere(cls, radius: float | Array) -> "Shape":
         """A ball of a radius [m]."""
-        return cls(jnp.zeros(3), as_real_quantity("radius [m]", radius, above=0.0), "sphere")
+        return cls("sphere", jnp.zeros(3), as_real_quantity("radius [m]", radius, above=0.0))
 
     @classmethod
     def capsule(cls, radius: float | Array, length: float | Array, *, axis: int = 2) -> "Shape":
@@ -39,7 +39,7 @@ class Shape(eqx.Module):
             raise ValueError(f"axis: got {axis!r}, expected 0, 1 or 2: the axis of the body's frame that it is along.")
         along = as_real_quantity("length [m]", length, above=0.0) / 2
         half = jnp.stack([along if i == axis else jnp.zeros_like(along) for i in range(3)])
-        return cls(half, as_real_quantity("radius [m]", radius, above=0.0), "capsule")
+        return cls("capsule", half, as_real_quantity("radius [m]", radius, above=0.0))
 
     @classmethod
     def box(cls, size: NestedArrayLike) -> "Shape":
@@ -47,7 +47,7 @@ class Shape(eqx.Module):
         size = as_real_quantity("size [m]", size, above=0.0)
         if size.shape != (3,):
             raise ValueError(f"size [m]: got the shape {size.shape}, expected three edges, (3,).")
-        return cls(size / 2, jnp.zeros((), size.dtype), "box")
+        return cls("box", size / 2, jnp.zeros((), size.dtype))
 
 
 class ShapeTable(NamedTuple):
