@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 
 from physjax.physics.rigid.planar import PlanarBodies
 from physjax.show import obstacles
+from physjax.show.bodies import choose_body_colours
 from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
 from physjax.show.flat_page import describe_flat_obstacle, pack_flat_bodies, take_flat_bodies
@@ -25,9 +26,12 @@ from physjax.show.page_data import (
     QUANTISATION_STEPS,
     Json,
     build_padded_box,
+    describe_links,
     describe_obstacle,
+    number_shapes,
     pack_frames,
     quantise_positions,
+    to_hexes,
 )
 from physjax.show.pages import check_output_path, embed_page, fill_page, read_web_file, write_page
 from physjax.show.panels import Scenery, build_scenery
@@ -93,9 +97,9 @@ def view(
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
     lines coloured by strain, a `solids` shape or one for each body, in the plane a `rigid.PlanarShape`. Without it bodies
-    are boxes of their inertia or the shapes of the scene's `rigid.Solids`, nodes are joined by the scene's springs or rods,
-    and everything else is dots with their paths. `color` is one for surfaces and bodies, a value for each lane for dots and
-    bodies in the plane. The page plays `speed` seconds of the run a second, in `fps`
+    are the shapes of the scene's `rigid.Solids` or boxes of their inertia, nodes are joined by the scene's springs or rods,
+    and everything else is dots with their paths; rods and ropes between bodies are lines. `color` is one for surfaces and
+    bodies, or a value for each lane for dots and bodies. The page plays `speed` seconds of the run a second, in `fps`
     frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
     Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; runs in one dimension
@@ -108,9 +112,11 @@ def view(
     who = "animate.view"
     seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
     flat = isinstance(film.state, PlanarBodies) and isinstance(seen, PlanarFigures | Dots)
+    links = seen.links if isinstance(seen, Bodies | PlanarFigures) else None
     if flat:
         shapes = seen.shapes if isinstance(seen, PlanarFigures) else None
         run, bodies = take_flat_bodies(who, film, shapes, color)
+        run = run if links is None else links.add_nodes(run)
     else:
         run, bodies = (seen.surface() if isinstance(seen, Bodies) else seen).run, {}
     frames, fps = schedule(who, run, fps, speed)
@@ -120,7 +126,8 @@ def view(
     elif isinstance(seen, Surface):
         part = _describe_surface(seen, scenery, frames, color)
     elif isinstance(seen, Bodies):
-        part = _describe_bodies(seen, scenery, frames, color)
+        colours = choose_body_colours(who, film, color, len(seen.shapes))
+        part = _describe_bodies(seen, scenery, frames, colours)
     elif isinstance(seen, Lines):
         part = _describe_lines(who, seen, scenery, frames)
     else:
@@ -140,6 +147,7 @@ def view(
             "up": scenery.up,
             "light": obstacles.LIGHT_DIRECTION.tolist(),
             "part": part,
+            "links": None if links is None else describe_links(links, scenery, frames),
             "obstacles": [describe(contact, scenery, frames) for contact in scenery.contacts],
         }
     )
@@ -157,16 +165,18 @@ def _describe_surface(
     }
 
 
-def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None") -> Json:
-    """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape."""
+def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], colours: np.ndarray) -> Json:
+    """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape that differs."""
     turn = np.roll(seen.orientation[frames], -1, axis=-1)
+    numbers, different = number_shapes(seen.shapes)
     return {
         "kind": "bodies",
-        "color": _to_hex(color),
+        "colors": to_hexes(colours),
         "nodes": seen.run.position.shape[1],
         "places": pack_frames(quantise_positions(scenery, seen.run.position[frames].astype(float))),
         "turns": pack_frames(np.round(turn * QUANTISATION_STEPS).astype(np.int16)),
-        "shapes": [{"vertices": s.vertices.ravel().tolist(), "faces": s.faces.ravel().tolist()} for s in seen.shapes],
+        "shape": numbers,
+        "shapes": [{"vertices": s.vertices.ravel().tolist(), "faces": s.faces.ravel().tolist()} for s in different],
     }
 
 
