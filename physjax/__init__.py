@@ -47,6 +47,7 @@ from physjax.trajectory import Trajectory
 if TYPE_CHECKING:
     from physjax import projectile, scenes, show, study
     from physjax.constraints import constraint_forces
+    from physjax.live import explore
     from physjax.physics import contacts, emitters, rigid, springs
     from physjax.physics.forces import flows as fields
     from physjax.physics.rigid import inertia
@@ -81,6 +82,7 @@ __all__ = [
     "contacts",
     "emitters",
     "energy",
+    "explore",
     "export",
     "fields",
     "fit",
@@ -123,6 +125,7 @@ _LAZY = {
     "contacts": "physjax.physics.contacts",
     "emitters": "physjax.physics.emitters",
     "energy": "physjax.study.energy",
+    "explore": "physjax.live:explore",
     "export": "physjax.show.export",
     "fields": "physjax.physics.forces.flows",
     "fit": "physjax.study.inverse.fit:fit",

@@ -25,6 +25,7 @@ from physjax.loops import Moment, Time, moment_at, repeat_steps, to_float_time
 from physjax.particles import Particles, view_centers
 from physjax.parts import as_module
 from physjax.roots import find_first_root
+from physjax.summaries import Row, format_array, write_summary, write_table
 from physjax.vectors import add_trailing_axes, norm
 
 NODES_PER_BATCH = 64
@@ -39,6 +40,13 @@ class Crossing(NamedTuple):
     velocity: Float[Array, "*lanes dim"]
     ok: Bool[Array, "*lanes"]
 
+    def __repr__(self) -> str:
+        """When, where and how fast."""
+        return write_summary("Crossing", describe_crossing(self))
+
+    def _repr_html_(self) -> str:
+        return write_table("Crossing", describe_crossing(self))
+
 
 class BodyCrossing(NamedTuple):
     """What `Crossing` says of each rigid body, by its center of mass, and its `state`; where it has none, `ok` False and NaN.
@@ -51,6 +59,16 @@ class BodyCrossing(NamedTuple):
     velocity: Float[Array, "*lanes dim"]
     ok: Bool[Array, "*scenes"]
     state: Any
+
+    def __repr__(self) -> str:
+        """When, where and how fast."""
+        return write_summary("BodyCrossing", describe_crossing(self))
+
+
+def describe_crossing(found: Crossing | BodyCrossing) -> list[Row]:
+    """What a summary says of a crossing."""
+    rows = [("time", format_array(found.time, "s")), ("position", format_array(found.position, "m"))]
+    return [*rows, ("velocity", format_array(found.velocity, "m/s")), ("ok", format_array(found.ok))]
 
 
 class Height(eqx.Module):

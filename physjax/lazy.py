@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from importlib import import_module
 from pkgutil import iter_modules
 from types import ModuleType
+from typing import Any
 
 
 def serve_submodules(
@@ -18,3 +19,9 @@ def serve_submodules(
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return names, load, lambda: names
+
+
+def call_late(name: str, *arguments: Any) -> Any:
+    """Call `module:function`, loaded now: for what a noun offers and a part of the house above it does, such as drawing."""
+    module, _, function = name.partition(":")
+    return getattr(import_module(module), function)(*arguments)

@@ -19,6 +19,7 @@ from physjax.checks import demand_start_outside
 from physjax.loops import Time
 from physjax.old_names import CONTACT_OLD_NAMES, FORCE_OLD_NAMES, serve_old_names
 from physjax.particles import Particles, demand_particles
+from physjax.summaries import represent_part
 from physjax.vectors import scale
 
 
@@ -91,6 +92,7 @@ class Force(eqx.Module):
         [6. 8.]
     """
 
+    __repr__ = represent_part
     couples: ClassVar[bool] = False
     is_field: ClassVar[bool] = False
     """Whether it is proportional to mass and gives an `acceleration`, as a `Field` does."""
@@ -222,6 +224,7 @@ class Contact(eqx.Module):
 
     couples: ClassVar[bool] = False
     response: ClassVar[Callable | None] = None
+    __repr__ = represent_part
     memory: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, **options: object):
@@ -270,9 +273,7 @@ def build_memory_mask(part: PyTree) -> PyTree:
         return mask
     if all(getattr(part, name) is None for name in part.memory):
         name = type(part).__name__
-        raise ValueError(
-            f"{name}: got one that no scene has prepared, expected it given to Scene(...), not to replace()."
-        )
+        raise ValueError(f"{name}: got one that no scene has prepared; give it to Scene(...), not to replace().")
     return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
 
 
@@ -371,7 +372,8 @@ def prepare_contact(contact: object, dtype: np.dtype) -> Contact:
 def _prepare_part(kind: str, part: PyTree, good: bool, expected: str, dtype: np.dtype) -> PyTree:
     """A force or contact as a pytree of arrays whose floating-point numbers have the scene's dtype; a TypeError otherwise."""
     if not good:
-        raise TypeError(f"{kind}s: got {type(part).__name__} {part!r}, expected {expected}.")
+        got = f"the class {part.__name__}" if isinstance(part, type) else f"{type(part).__name__} {part!r}"
+        raise TypeError(f"{kind}s: got {got}, expected {expected}.{' Call it.' * isinstance(part, type)}")
     part = adopt_force(part) if kind == "force" else part
     for path, leaf in jax.tree_util.tree_leaves_with_path(part):
         _demand_array(part, path, leaf)

@@ -51,6 +51,8 @@ from physjax.quantities import (
     may_hide_lanes,
 )
 from physjax.stages import Stage, advance_force, close_joints, prescribe, resolve_contact
+from physjax.summaries import represent_scene, tabulate_scene
+from physjax.trials import find_faulty_force
 
 
 def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene":
@@ -125,7 +127,7 @@ class Scene(eqx.Module):
         self.forces = unify_gravity(forces, state.position.shape[-1])
         if emitter is not None and self.constraints:
             raise ValueError(
-                "Scene: got an emitter and joints, expected one of them: joined bodies live from the start. Leave one out."
+                "Scene: got an emitter and joints, expected one of them: joined bodies live from the start."
             )
         self.contacts = tuple(prepare_contact(contact, dtype) for contact in as_tuple("contact", contacts))
         for part in (*self.forces, *self.contacts):
@@ -133,6 +135,8 @@ class Scene(eqx.Module):
         for contact in self.contacts:
             contact.demand_fit(state, mass)
         self.forces = tuple(force.prepare(state, mass) for force in self.forces)
+        if (fault := find_faulty_force(state, mass, self.forces)) is not None:
+            raise TypeError(fault)
         self.state = state = mark_invalid_lanes(
             state, mass, (*self.forces, *self.contacts, pinned, emitter), self.contacts
         )
@@ -140,6 +144,8 @@ class Scene(eqx.Module):
         self.pinned = pinned
         self.reaction = None
         self.emitter = None if emitter is None else emitter.prepare(self)
+
+    __repr__, _repr_html_ = represent_scene, tabulate_scene
 
     @property
     def couples(self) -> bool:

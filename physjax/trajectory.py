@@ -3,20 +3,26 @@
 import os
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import concrete_or_none
 from physjax.crossing import BodyCrossing, Crossing, find_first_crossing
 from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
+from physjax.lazy import call_late
 from physjax.loops import moment_at
+from physjax.memories import replace_memories, select_stateful_parts
+from physjax.moments import build_dataset, build_frame_table, pick_frame, step_to_time
 from physjax.particles import Particles, callable_name, view_centers
-from physjax.parts import Contact, Function, as_module, build_memory_mask, has_memory
+from physjax.parts import Function
+from physjax.run_files import restore_run
 from physjax.scene import Scene
 
 
@@ -120,7 +126,7 @@ class Trajectory(eqx.Module):
             >>> flight.film.state.position.shape
             (21, 2)
         """
-        return _replace_memories(self._demand_scene("film"), self._demand_states(), self.parts)
+        return replace_memories(self._demand_scene("film"), self._demand_states(), self.parts)
 
     def __repr__(self) -> str:
         """One line: what was run, for how long, and whether it held."""
@@ -132,6 +138,77 @@ class Trajectory(eqx.Module):
         shape = "recorded" if self.state is None else f"position {self.position.shape} {self.position.dtype}"
         held = "ok" if ok.all() else f"{ok.size - ok.sum()} of {ok.size} blew up"
         return f"<Trajectory: {how}{len(time)} frames from t = {time.min():g} to {time.max():g} s, {shape}, {held}>"
+
+    def __len__(self) -> int:
+        """The number of frames, the start included.
+
+        Example:
+            >>> len(flight)
+            21
+        """
+        return self.time.shape[np.ndim(self.first_step)]
+
+    def __bool__(self) -> bool:
+        """True: a run is something, however few frames it has."""
+        return True
+
+    def __getitem__(self, frame: int) -> PyTree:
+        """The state at a frame, counted from 0 or, if negative, from the end.
+
+        Example:
+            >>> print(flight[-1].position)
+            [ 6.  -1.6]
+        """
+        return pick_frame(self._demand_states(), frame, len(self), np.ndim(self.first_step))
+
+    def at(self, t: ArrayLike) -> PyTree:
+        """The state at a time [s] of the run, or at several: stepped to it from the frame before, the last step shortened.
+
+        As accurate as the run itself, however few frames were saved. With derivatives, also by the time. Raises ValueError
+        for times outside of the run, and for a run that does not know its scene and method or has a dt for each lane.
+
+        Example:
+            >>> print(flight.at(1.0).position, flight.at(0.25).position)
+            [3.  9.1] [ 0.75  10.694]
+        """
+        self._demand_scene("at")
+        return step_to_time(self, t)
+
+    def energy(self) -> Float[Array | np.ndarray, "..."]:
+        """Kinetic and potential energy [J] at the frames, per lane or summed over coupled ones.
+
+        Example:
+            >>> print(flight.energy()[:3])
+            [221. 221. 221.]
+        """
+        return call_late("physjax.study.energy.over_time:measure_total", self)
+
+    def plot(self, looks: PyTree = None) -> Any:
+        """Draw the run: the paths of particles, else its last frame. Returns the figure; `looks` as in `animate.view`.
+
+        Example:
+            >>> flight.plot().axes[0].get_xlabel()
+            'x [m]'
+        """
+        return call_late("physjax.show.auto_plot:plot_run", self, looks)
+
+    def to_xarray(self) -> Any:
+        """The frames as an `xarray.Dataset`: dimensions time, lanes and component, with units. Needs xarray.
+
+        Example:
+            >>> dict(flight.to_xarray().position.sizes)
+            {'time': 21, 'component': 2}
+        """
+        return build_dataset(self)
+
+    def to_pandas(self) -> Any:
+        """The frames as a `pandas.DataFrame`: a row for each frame and lane, a column for each component. Needs pandas.
+
+        Example:
+            >>> list(flight.to_pandas().columns)
+            ['time', 'position_x', 'position_y', 'velocity_x', 'velocity_y']
+        """
+        return build_frame_table(self)
 
     def crossing(self, surface: PyTree, *, direction: int | None = None) -> Crossing | BodyCrossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
@@ -204,7 +281,7 @@ class Trajectory(eqx.Module):
         """
         arrays = read_arrays(path, "a run written by Trajectory.save")
         demand_saved_run(path, arrays)
-        return _restore_run(cls, arrays, scene, method)
+        return restore_run(cls, arrays, scene, method)
 
     def _collect_saved_trees(self) -> dict[str, PyTree]:
         """The pytrees that go into a file, by the name they have there."""
@@ -243,126 +320,3 @@ def _find_first_bad_step(scene, method, dt, first_step, steps):
 
     bad = jnp.full(scene.status_shape, -1, jnp.int32)
     return lax.while_loop(going, body, (jnp.zeros((), jnp.int32), scene, bad))[2]
-
-
-def select_stateful_parts(scene: Scene) -> tuple:
-    """The parts of the scene with memory: forces that advance, contacts that remember since when lanes touch them, an emitter."""
-    return tuple(part for part in (*scene.forces, *scene.contacts, scene.emitter) if has_memory(part))
-
-
-def _replace_memories(scene: Scene, state: PyTree, parts: tuple) -> Scene:
-    """The scene with another state, and with other memories in those of its parts that have some."""
-    remaining = iter(parts)
-    renewed = lambda old: tuple(next(remaining) if has_memory(part) else part for part in old)  # noqa: E731
-    forces, contacts, (emitter,) = renewed(scene.forces), renewed(scene.contacts), renewed((scene.emitter,))
-    return scene.replace(state=state, forces=forces, contacts=contacts, emitter=emitter)
-
-
-def _restore_run(cls: type, saved: dict[str, np.ndarray], scene: Scene | None, method: Callable | None) -> Trajectory:
-    """A trajectory from the arrays of a file: NumPy for a reference, which has no step, as it was before."""
-    arrays: dict[str, Array | np.ndarray] = dict(saved)
-    ours, made_by = "dt" in arrays, str(arrays.pop("method"))
-    if ours and method is not None and made_by not in (callable_name(method), "NoneType"):
-        raise ValueError(
-            f"load: the run was made with the method {made_by}, got {callable_name(method)}. Give the method it was made "
-            "with; to go on with another one, simulate(run.final_scene, ...)."
-        )
-    if scene is not None and ours:
-        scene = _cast_to_run(scene, saved)
-    # a run of float64 without 64-bit types stays in NumPy, where nothing is rounded
-    exact = lambda array: ours and jax.dtypes.canonicalize_dtype(array.dtype) == array.dtype  # noqa: E731
-    floats = [array for array in arrays.values() if array.dtype.kind == "f"]
-    if all(map(exact, floats)):
-        arrays = {name: jnp.asarray(array) if ours else array for name, array in arrays.items()}
-    recorded = {name.removeprefix("recorded"): array for name, array in arrays.items() if name.startswith("recorded")}
-    final_scene, parts = (None, ()) if scene is None or not ours else _restore_end(scene, arrays, not recorded)
-    state = None
-    if not recorded:
-        state = _fill_tree("state", Particles(jnp.zeros(0), jnp.zeros(0)) if scene is None else scene.state, arrays)
-    return cls(
-        time=arrays["time"],
-        state=state,
-        parts=parts,
-        recorded=recorded.get("", recorded) if recorded else None,
-        ok=arrays["ok"],
-        scene=scene,
-        final_scene=final_scene,
-        stepper=None if method is None else as_module(method),
-        dt=arrays.get("dt"),
-        first_step=arrays["first_step"],
-        save_every=int(arrays["save_every"]),
-        steps=int(arrays["steps"]),
-    )
-
-
-def _restore_end(scene: Scene, arrays: dict[str, Array | np.ndarray], filmed: bool) -> tuple[Scene, tuple]:
-    """The scene at the end of the run, and the parts with memory over its frames, where these were `filmed`."""
-    final_state = _fill_tree("final_state", scene.state, arrays)
-    if final_state.position.shape != scene.state.position.shape:
-        raise ValueError(
-            f"load: the run has the shape {final_state.position.shape}, the given scene {scene.state.position.shape}. "
-            "Give the scene the run was made with."
-        )
-    stateful = select_stateful_parts(scene)
-    final_parts = _fill_tree("final_parts", stateful, arrays, shaped=True)
-    _demand_same_contacts(stateful, final_parts)
-    parts = ()
-    if filmed:
-        parts = _fill_tree("parts", stateful, arrays, shaped=True)
-        _demand_same_contacts(stateful, parts)
-    return _replace_memories(scene, final_state, final_parts), parts
-
-
-def _cast_to_run(scene: Scene, arrays: dict[str, np.ndarray]) -> Scene:
-    """The scene with its numbers in the run's precision, as they were when it was made; ValueError where they are coarser."""
-    run, here = arrays.get("final_state.position", arrays["time"]).dtype, scene.state.dtype
-    if run == here:
-        return scene
-    if jnp.finfo(run).bits > jnp.finfo(here).bits:
-        raise ValueError(
-            f"load: the run is in {run}, the given scene in {here}, too coarse to go on from there. Build the scene in "
-            f'{run}: jax.config.update("jax_enable_x64", True) first.'
-        )
-    return jax.tree.map(lambda leaf: leaf.astype(run) if eqx.is_inexact_array(leaf) else leaf, scene)
-
-
-def _demand_same_contacts(given: tuple, found: tuple) -> None:
-    """Raise a ValueError naming a number of a contact, which never changes, that is another one in the file."""
-    still = [
-        jax.tree.map(lambda changing: not changing, build_memory_mask(part))
-        for part in given
-        if isinstance(part, Contact)
-    ]
-    pick = lambda parts: [part for part in parts if isinstance(part, Contact)]  # noqa: E731
-    here, there = eqx.filter(pick(given), still), eqx.filter(pick(found), still)
-    for (keys, ours), theirs in zip(jax.tree_util.tree_leaves_with_path(here), jax.tree.leaves(there), strict=True):
-        if concrete_or_none(ours) is not None and not np.array_equal(ours, theirs):
-            name = jax.tree_util.keystr(keys, simple=True, separator=".").partition(".")[2]
-            raise ValueError(
-                f"load: the run was made with a contact whose {name} was {np.asarray(theirs)}, in the given scene it is "
-                f"{np.asarray(ours)}. Give the scene the run was made with; to go on with another one, begin from its last frame."
-            )
-
-
-def _fill_tree(group: str, like: PyTree, arrays: dict[str, Array | np.ndarray], shaped: bool = False) -> PyTree:
-    """The pytree `like` with its leaves replaced by that group of arrays, `shaped` as they are, of parts also with frames."""
-    leaves, tree = jax.tree_util.tree_flatten_with_path(like)
-    names = [group + jax.tree_util.keystr(keys) for keys, _ in leaves]
-    # what rounding leaves out of a moment was nothing in files from before it was kept
-    rests = [name for name in names if name.endswith("_rest") and name.removesuffix("_rest") in arrays]
-    arrays = {name: np.zeros_like(arrays[name.removesuffix("_rest")]) for name in rests} | arrays
-    missing = [name for name in names if name not in arrays]
-    if missing:
-        raise ValueError(
-            f"load: the file lacks {missing[0]!r}, which the scene has. Give the scene the run was made with."
-        )
-    over_time = lambda shape: (*arrays["time"].shape[: axis + 1], *shape[axis:])  # noqa: E731
-    axis = arrays["first_step"].ndim
-    for name, (_, leaf) in zip(names, leaves, strict=True):
-        shapes = (jnp.shape(leaf), over_time(jnp.shape(leaf)) if group == "parts" else jnp.shape(leaf))
-        if shaped and (arrays[name].shape not in shapes or arrays[name].dtype != jnp.result_type(leaf)):
-            raise ValueError(
-                f"load: {name}: the file has {arrays[name].dtype} of shape {arrays[name].shape}, the given scene "
-                f"{jnp.result_type(leaf)} of shape {jnp.shape(leaf)}. Give the scene the run was made with."
-            )
-    return jax.tree.unflatten(tree, [arrays[name] for name in names])

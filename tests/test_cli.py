@@ -113,12 +113,6 @@ def test_python_m_physjax_is_the_same_command():
     assert "chart" in run.stdout
 
 
-def test_no_command_explains_itself(capsys):
-    with pytest.raises(SystemExit):
-        main([])
-    assert "COMMAND" in capsys.readouterr().err
-
-
 def test_sweep_goes_over_the_numbers_of_a_scene_and_draws(tmp_path, capsys):
     command = ["sweep", "projectile", "--over", "speed=10:20:3", "angle=0.3:1.2:4", "--outcome", "distance"]
     assert main([*command, "--steps", "64", "--out", str(tmp_path)]) == 0

@@ -43,11 +43,22 @@ def _run_aim(options: argparse.Namespace) -> None:
         aimed = aim_at(scene, options.target, speed=options.speed)
         print(_format_arcs(aimed, any_speed=options.speed is None))
         if not aimed.ok:
-            print("The target is out of reach: these are the nearest misses.")
+            print(describe_reach(scene, options, float(aimed.low.miss)))
         matplotlib.use("Agg")
         with write_atomically(folder / "aim.png", "wb") as file:
             aimed.plot().figure.savefig(file, dpi=125)  # pyright: ignore[reportAttributeAccessIssue]  # ours are in a figure, not in a subfigure
     print(f"Picture: {folder / 'aim.png'}")
+
+
+def describe_reach(scene: "Scene", options: argparse.Namespace, miss: float) -> str:
+    """How near a shot comes that does not hit, and the least speed that does."""
+    from physjax.study.inverse.aim import aim_at
+
+    if options.speed is None:
+        return f"The target is out of reach at any speed that was tried: the nearest miss is {miss:.3g} m away."
+    least = aim_at(scene, options.target).low
+    needs = f"it needs at least {float(least.speed):.4g} m/s" if least.ok else "no speed that was tried hits it"
+    return f"The target is out of reach: {options.speed:g} m/s comes within {miss:.3g} m of it; {needs}."
 
 
 def _format_arcs(aimed: "Aimed", any_speed: bool) -> str:

@@ -39,7 +39,7 @@ def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     command.set_defaults(run=_run_chart)
 
 
-def _run_chart(options: argparse.Namespace) -> None:
+def _run_chart(options: argparse.Namespace) -> int:
     """Study scenes one by one: PNG, CSV, one HTML page and a printed table; or a report on each scene instead."""
     import matplotlib
 
@@ -50,16 +50,27 @@ def _run_chart(options: argparse.Namespace) -> None:
     folder = ensure_writable_folder(options.out)
     matplotlib.use("Agg")
     if options.report:
-        return _write_reports(names, folder)
+        _write_reports(names, folder)
+        return 0
     results, summary = [], ""
-    for name in names:
-        results.append(_study_scene(name, folder, options.quick))
+    for number, name in enumerate(names, 1):
+        try:
+            results.append(_study_scene(name, folder, options.quick, f"{number}/{len(names)} {name}"))
+        except KeyboardInterrupt:
+            done = (
+                f"{len(results)} of {len(names)} scenes are done: {folder / 'index.html'}"
+                if results
+                else "none is done"
+            )
+            print(f"\nphysjax chart: stopped by Ctrl-C; {done}", file=sys.stderr)
+            return 130
         summary = _summarise([result for result, _ in results])
         # so far, so that it can be read while the others are studied
         _write_page(folder, summary, [section for _, section in results])
         print(f"Chart: {folder / f'{name}.png'}", flush=True)
     print(f"\nThe fastest run whose error stays below a fraction of the path:\n\n{summary}\n")
     print(f"Measured on {describe_machine()}.\nCharts: {folder / 'index.html'}")
+    return 0
 
 
 def _choose_scenes(names: list[str], everything: bool) -> list[str]:
@@ -109,7 +120,7 @@ def _write_reports(names: list[str], folder: Path) -> None:
         print(f"Report: {folder / f'{name}.html'}", flush=True)
 
 
-def _study_scene(name: str, folder: Path, quick: bool) -> "tuple[WorkPrecision, Section]":
+def _study_scene(name: str, folder: Path, quick: bool, label: str) -> "tuple[WorkPrecision, Section]":
     """The work-precision study of a scene and its section of the page; PNG and CSV are written."""
     import jax
 
@@ -122,7 +133,7 @@ def _study_scene(name: str, folder: Path, quick: bool) -> "tuple[WorkPrecision, 
         problem = SCENES[name]()
         count = len(accuracy.list_compared_methods(problem.scene))
     rivals = accuracy.default_rivals() if problem.is_ode else ()
-    with tqdm(total=1 + count + len(rivals), desc=f"{name:<16}", unit="method", file=sys.stderr) as bar:
+    with tqdm(total=1 + count + len(rivals), desc=f"{label:<20}", unit="method", file=sys.stderr) as bar:
 
         def progress(what: str) -> None:
             bar.set_postfix_str(what)

@@ -24,7 +24,9 @@ def add_command(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     command.add_argument("--method", default="rk4", metavar="NAME", help="a method of stepping (default: rk4)")
     command.add_argument("--steps", type=int, default=1024, help="steps of each run (default: 1024)")
     command.add_argument(
-        "--out", default="sweep", metavar="DIR", help="where chunks, sweep.npz and the picture go (default: sweep)"
+        "--out",
+        metavar="DIR",
+        help="where chunks, sweep.npz and the picture go (default: sweep/, and there a folder named after what is swept)",
     )
     command.set_defaults(run=_run_sweep)
 
@@ -45,7 +47,7 @@ def _run_sweep(options: argparse.Namespace) -> None:
     outcome = demand_known("outcome", options.outcome, OBSERVABLES)
     method = find_method(demand_known("method", options.method, list_all_methods()))
     axes = dict(_parse_range(text) for text in options.over)
-    folder = ensure_writable_folder(options.out)
+    folder = ensure_writable_folder(options.out or f"sweep/{options.scene}-{outcome}-over-{'-'.join(axes)}")
     matplotlib.use("Agg")
     with jax.enable_x64(True):
         found = sweep_scene(build, axes, outcome, method=method, steps=options.steps, out=folder / "chunks")

@@ -15,6 +15,9 @@ from physjax.scenes.registry import scene
 from physjax.study.energy.quantities import ENERGY
 from physjax.study.problem import Problem, Truth
 
+SHORTEST_BOUNCE_SECONDS = 1e-7
+"""A ball whose flight is shorter than this lies on the floor: it rises by less than a nanometre."""
+
 
 @scene
 def bouncing_ball(restitution: float = 0.8, wind: float = 10.0, g: float = 9.8) -> Problem:
@@ -226,5 +229,7 @@ def _trace_bounces(times, air, height, restitution):
         flight = air.landing(height, velocity)
         gained, now = air.after(np.clip(t - begun, 0.0, flight), velocity)
         position, speed = np.where(t < begun, position, height + gained), np.where(t < begun, speed, now)
-        begun, velocity, height = begun + flight, -restitution * air.after(flight, velocity)[1], floor
+        # infinitely many bounces end in a finite time: flights too short to see are rest
+        begun = np.where(flight > SHORTEST_BOUNCE_SECONDS, begun + flight, np.inf)
+        velocity, height = -restitution * air.after(flight, velocity)[1], floor
     return position, speed

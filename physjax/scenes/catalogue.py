@@ -22,6 +22,8 @@ from physjax.study.problem import Problem
 
 TABLE = "gallery.csv"
 """What the list says of each scene, among the data of this folder."""
+LINE_WIDTH = 80
+"""Columns of a terminal as narrow as they come."""
 
 
 class Entry(NamedTuple):
@@ -39,7 +41,7 @@ class Entry(NamedTuple):
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.size}", self.title, f"truth: {self.truth}"]
         return "\n".join(
-            fill(line, 110, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
+            fill(line, LINE_WIDTH, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
             for line, indent in zip(lines, (0, 4, 4), strict=True)
         )
 

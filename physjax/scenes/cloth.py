@@ -46,6 +46,10 @@ def hanging_rope(
 def _pull_into_corner(along: np.ndarray, span: float) -> np.ndarray:
     """Points of a rope that is pulled taut into a corner off the middle, at the distances `along` it, `(points, 2)` [m]."""
     length = along[-1]
+    if not span < length:
+        raise ValueError(
+            f"hanging_rope: got a length of {length:g} m and a span of {span:g} m, expected a rope longer than its span."
+        )
     left, right = 0.65 * length, 0.35 * length
     corner = (left**2 - right**2) / (2 * span)
     depth = -np.sqrt(left**2 - (corner + span / 2) ** 2)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from physjax.compiling import announce_compiling
+from physjax.scenes.parameters import demand_sensible
 from physjax.study.problem import Problem
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ FAILURES: dict[str, Callable[..., "Failure"]] = {}
 def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
     """Register a function that builds a problem under its own name; the first line of its docstring is its title.
 
-    The problem bears that name, which is shown while it compiles.
+    The problem bears that name, which is shown while it compiles. Numbers that make no sense are refused by name and unit.
 
     Example:
         >>> @scenes.scene
@@ -35,6 +36,7 @@ def scene(build: Callable[..., Problem]) -> Callable[..., Problem]:
 
     @functools.wraps(build)
     def build_named(*arguments: Any, **numbers: Any) -> Problem:
+        demand_sensible(build, arguments, numbers)
         with announce_compiling(build.__name__):
             return build(*arguments, **numbers)._replace(name=build.__name__)
 

@@ -66,7 +66,14 @@ def heavy_top(spin: float = 90.0, tilt: float = 0.6, length: float = 0.05, g: fl
     mass = 0.2
     top = inertia.cylinder(mass, radius=0.06, length=0.02).about((0.0, 0.0, -length))
     i1, _, i3 = np.asarray(top.principal, float)
-    root = np.sqrt((i3 * spin) ** 2 - 4 * i1 * mass * g * length * np.cos(tilt))
+    square = (i3 * spin) ** 2 - 4 * i1 * mass * g * length * np.cos(tilt)
+    if not square > 0:
+        least = np.sqrt(4 * i1 * mass * g * length * np.cos(tilt)) / i3
+        raise ValueError(
+            f"heavy_top: got a spin of {spin:g} rad/s, too slow to hold the top up: expected more than {least:.3g} rad/s "
+            "for this length and tilt."
+        )
+    root = np.sqrt(square)
     pace = (i3 * spin + np.array([-1.0, 1.0]) * root) / (2 * i1 * np.cos(tilt))
     own = spin - pace * np.cos(tilt)
     axis = np.array([np.sin(tilt), np.cos(tilt), 0.0])

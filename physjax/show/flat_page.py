@@ -10,7 +10,7 @@ from physjax.parts import Contact
 from physjax.physics.rigid.planar import PlanarShape
 from physjax.show import level_sets
 from physjax.show.frames import Frames
-from physjax.show.page_data import Json, number_shapes, pack_frames, quantise_positions, to_hexes
+from physjax.show.page_data import Json, number_shapes, quantise_positions, to_hexes
 from physjax.show.panels import Scenery
 from physjax.show.planar import EDGE_BRIGHTNESS, PlanarPicture, build_planar_outline, take_planar_bodies
 from physjax.show.stage import Stage
@@ -59,30 +59,30 @@ def take_flat_bodies(
     }
 
 
-def pack_flat_bodies(part: Json, scenery: Scenery, frames: list[int]) -> Json:
-    """The bodies with their places and angles at the given frames as text."""
+def quantise_flat_bodies(part: Json, scenery: Scenery, frames: list[int]) -> Json:
+    """The bodies with their places and angles at the given frames as 16-bit whole numbers."""
     angle = np.nan_to_num(part["angles"][frames])
     steps = np.round(angle / np.pi * HALF_TURN_STEPS) + HALF_TURN_STEPS
     turned = (np.mod(steps, 2 * HALF_TURN_STEPS) - HALF_TURN_STEPS).astype(np.int16)
     place = np.where(np.isfinite(part["angles"][frames])[..., None], part["places"][frames], np.nan)
-    return part | {"places": pack_frames(quantise_positions(scenery, place)), "angles": pack_frames(turned)}
+    return part | {"places": quantise_positions(scenery, place), "angles": turned}
 
 
-def describe_flat_obstacle(contact: Contact, scenery: Scenery, frames: list[int]) -> Json:
+def describe_flat_obstacle(contact: Contact, scenery: Scenery, frames: list[int], points: int = CONTOUR_POINTS) -> Json:
     """A surface as areas behind it and lines along its edge [m], once or, if it moves, at moments spread over the frames."""
     times = scenery.run.time[frames]
     middle, reach = (scenery.stage.low + scenery.stage.high) / 2, ROOM_SHARE * scenery.stage.size
     wide = Stage(middle - reach, middle + reach)
     count = min(len(frames), MAX_OBSTACLE_STATES) if level_sets.moves(contact, wide, times) else 1
     chosen = np.linspace(0, len(frames), count, endpoint=False).astype(int)
-    return {"states": [{"frame": int(i)} | _trace_contours(contact, wide, float(times[i])) for i in chosen]}
+    return {"states": [{"frame": int(i)} | _trace_contours(contact, wide, float(times[i]), points) for i in chosen]}
 
 
-def _trace_contours(contact: Contact, stage: Stage, t: float) -> Json:
+def _trace_contours(contact: Contact, stage: Stage, t: float, points: int) -> Json:
     """The polygons of the wrong side of a contact in a box, and the lines of its edge."""
     from matplotlib.figure import Figure
 
-    x, y = (np.linspace(low, high, CONTOUR_POINTS) for low, high in zip(*stage, strict=True))
+    x, y = (np.linspace(low, high, points) for low, high in zip(*stage, strict=True))
     distance = level_sets.evaluate_distance(contact, t, np.stack(np.meshgrid(x, y), axis=-1))
     if not distance.min() < 0:
         return {"areas": [], "edges": []}

@@ -41,12 +41,16 @@ class Frames(NamedTuple):
 
     def title(self, frame: int) -> str:
         """The time of a frame, with three figures of the whole duration, and where the run ended if it blew up."""
+        return self.titles([frame])[0]
+
+    def titles(self, frames: Sequence[int]) -> list[str]:
+        """The titles of several frames."""
         span = max(np.ptp(self.time), MIN_DURATION_SECONDS)
         unit, size = ("d", DAY_SECONDS) if span > 3 * DAY_SECONDS else ("s", 1.0)
         decimals = int(np.clip(2 - np.floor(np.log10(span / size)), 0, 12))
         end = f"\nblew up after t = {self.time[self.good_frames - 1] / size:.3g} {unit}" if self.blew_up else ""
         caption = f"\n{self.caption}" if self.caption else ""
-        return f"t = {self.time[frame] / size:.{decimals}f} {unit}{caption}{end}"
+        return [f"t = {self.time[frame] / size:.{decimals}f} {unit}{caption}{end}" for frame in frames]
 
 
 def take_frames(

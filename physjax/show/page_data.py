@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound=tuple)
 Json = dict[str, Any]
-"""An object of the page's JSON."""
+"""An object of the page's JSON; arrays in it are sent as `pack_arrays` writes them."""
 QUANTISATION_STEPS = 32767
 """A position is one of this many steps to either side of the middle of the box, along each of its sides."""
 HIDDEN_CODE = -32768
@@ -29,6 +29,15 @@ PAGE_CELLS = 48
 turns without effort. One that moves is sent many times and has `outlines.PICTURE_CELLS`."""
 MAX_OBSTACLE_STATES = 60
 """A surface that changes in no simple way is sent at most this many times, at some 20 kB each; in between it stays."""
+
+
+def pack_arrays(content: Any) -> Any:
+    """The content of a page with the arrays in it as text."""
+    if isinstance(content, np.ndarray):
+        return pack_frames(content)
+    if isinstance(content, dict):
+        return {name: pack_arrays(part) for name, part in content.items()}
+    return [pack_arrays(part) for part in content] if isinstance(content, list) else content
 
 
 def pack_frames(array: np.ndarray) -> str:
@@ -71,8 +80,8 @@ def describe_links(links: Links, scenery: Scenery, frames: list[int]) -> Json:
     ends = links.ends[frames].reshape(len(frames), -1, links.ends.shape[-1])
     return {
         "nodes": ends.shape[1],
-        "places": pack_frames(quantise_positions(scenery, ends)),
-        "held": pack_frames(links.held[frames].astype(np.uint8)),
+        "places": quantise_positions(scenery, ends),
+        "held": links.held[frames].astype(np.uint8),
     }
 
 
@@ -118,8 +127,8 @@ def _describe_meshes(contact: Contact, first: Outline, scenery: Scenery, frames:
         if number:
             outline = outlines.build_outline(contact, scenery.stage, float(scenery.run.time[frames[number]]))
         vertices, faces = _triangulate(outline)
-        places = pack_frames(quantise_positions(scenery, vertices))
-        states.append({"frame": number, "places": places, "faces": pack_frames(faces.astype(np.int32))})
+        places = quantise_positions(scenery, vertices)
+        states.append({"frame": number, "places": places, "faces": faces.astype(np.int32)})
     return {"kind": "mesh", "solid": first.solid, "one_sided": first.normals is not None, "states": states}
 
 

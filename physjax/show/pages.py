@@ -17,9 +17,12 @@ def read_web_file(name: str) -> str:
 
 
 def fill_page(name: str, **parts: object) -> str:
-    """A template of web/ with the buttons of tools.html and the program of data.js, each `__PART__` replaced by its content."""
+    """A template of web/ with the buttons of tools.html, the program of data.js and the colours of colors.css.
+
+    Each `__PART__` is replaced by its content.
+    """
     page = read_web_file(name).replace("__TOOLS__", read_web_file("tools.html"))
-    page = page.replace("__DATA__", read_web_file("data.js"))
+    page = page.replace("__DATA__", read_web_file("data.js")).replace("__COLORS__", read_web_file("colors.css"))
     for part, content in parts.items():
         page = page.replace(f"__{part}__", str(content))
     return page

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from physjax.show import solids
 from physjax.show.bodies import bodies
 from physjax.show.frames import find_up_axis
+from physjax.show.over_time import over_time, phase
 from physjax.show.particles import particles
 from physjax.show.spring_lines import springs
 from physjax.show.stage import AZIMUTH, ELEVATION
@@ -27,8 +28,10 @@ __all__ = [
     "bodies",
     "cloth",
     "gradient_health",
+    "over_time",
     "particles",
     "paths",
+    "phase",
     "solids",
     "springs",
     "style",

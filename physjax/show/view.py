@@ -10,35 +10,16 @@ import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-import numpy as np
 from jax.typing import ArrayLike
 
-from physjax.physics.rigid.planar import PlanarBodies
-from physjax.show import obstacles
-from physjax.show.bodies import choose_body_colours
-from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable
+from physjax.show.drawables import Look
 from physjax.show.films import schedule
-from physjax.show.flat_page import describe_flat_obstacle, pack_flat_bodies, take_flat_bodies
-from physjax.show.lines import Lines
-from physjax.show.page_data import (
-    QUANTISATION_STEPS,
-    Json,
-    build_padded_box,
-    describe_links,
-    describe_obstacle,
-    number_shapes,
-    pack_frames,
-    quantise_positions,
-    to_hexes,
-)
+from physjax.show.page_content import Pace, describe_run, take_seen
+from physjax.show.page_data import Json, pack_arrays
 from physjax.show.pages import check_output_path, embed_page, fill_page, read_web_file, write_page
-from physjax.show.panels import Scenery, build_scenery
-from physjax.show.plot import MAX_DRAWN_LANES
-from physjax.show.spring_lines import build_spring_lines
-from physjax.show.stage import AZIMUTH, ELEVATION
-from physjax.show.trails import build_trails
+from physjax.show.panels import build_scenery
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -46,8 +27,6 @@ if TYPE_CHECKING:
 
 NOTEBOOK_HEIGHT_PIXELS = 560
 """Height of the page inside a notebook [pixels]."""
-COLOUR_COUNT = 256
-"""Colours of a colour bar."""
 
 
 class View:
@@ -59,7 +38,7 @@ class View:
     """
 
     def __init__(self, content: Json):
-        self._content = content
+        self._content = pack_arrays(content)
         self.frames = tuple(content["frames"])
         self.fps = content["fps"]
 
@@ -110,113 +89,10 @@ def view(
         'wave.html'
     """
     who = "animate.view"
-    seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
-    flat = isinstance(film.state, PlanarBodies) and isinstance(seen, PlanarFigures | Dots)
-    links = seen.links if isinstance(seen, Bodies | PlanarFigures) else None
-    if flat:
-        shapes = seen.shapes if isinstance(seen, PlanarFigures) else None
-        run, bodies = take_flat_bodies(who, film, shapes, color)
-        run = run if links is None else links.add_nodes(run)
-    else:
-        run, bodies = (seen.surface() if isinstance(seen, Bodies) else seen).run, {}
-    frames, fps = schedule(who, run, fps, speed)
-    scenery = build_scenery(run, frames)
-    if flat:
-        part = pack_flat_bodies(bodies, scenery, frames)
-    elif isinstance(seen, Surface):
-        part = _describe_surface(seen, scenery, frames, color)
-    elif isinstance(seen, Bodies):
-        colours = choose_body_colours(who, film, color, len(seen.shapes))
-        part = _describe_bodies(seen, scenery, frames, colours)
-    elif isinstance(seen, Lines):
-        part = _describe_lines(who, seen, scenery, frames)
-    else:
-        part = _describe_dots(who, cast("Dots", seen), scenery, frames, color)
-    describe = describe_flat_obstacle if scenery.flat else describe_obstacle
-    return View(
-        {
-            "frames": frames,
-            "titles": [scenery.run.title(frame) for frame in frames],
-            "time": scenery.run.time[frames].tolist(),
-            "fps": fps,
-            "speed": float(speed),
-            "low": scenery.stage.low.tolist(),
-            "high": scenery.stage.high.tolist(),
-            "reach": [end.tolist() for end in build_padded_box(scenery)],
-            "from": [ELEVATION, AZIMUTH],
-            "up": scenery.up,
-            "light": obstacles.LIGHT_DIRECTION.tolist(),
-            "part": part,
-            "links": None if links is None else describe_links(links, scenery, frames),
-            "obstacles": [describe(contact, scenery, frames) for contact in scenery.contacts],
-        }
-    )
-
-
-def _describe_surface(
-    seen: Surface, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None"
-) -> Json:
-    return {
-        "kind": "surface",
-        "color": _to_hex(color),
-        "faces": pack_frames(seen.faces.astype(np.int32)),
-        "nodes": seen.run.position.shape[1],
-        "places": pack_frames(quantise_positions(scenery, seen.run.position[frames].astype(float))),
-    }
-
-
-def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], colours: np.ndarray) -> Json:
-    """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape that differs."""
-    turn = np.roll(seen.orientation[frames], -1, axis=-1)
-    numbers, different = number_shapes(seen.shapes)
-    return {
-        "kind": "bodies",
-        "colors": to_hexes(colours),
-        "nodes": seen.run.position.shape[1],
-        "places": pack_frames(quantise_positions(scenery, seen.run.position[frames].astype(float))),
-        "turns": pack_frames(np.round(turn * QUANTISATION_STEPS).astype(np.int16)),
-        "shape": numbers,
-        "shapes": [{"vertices": s.vertices.ravel().tolist(), "faces": s.faces.ravel().tolist()} for s in different],
-    }
-
-
-def _describe_lines(who: str, seen: Lines, scenery: Scenery, frames: list[int]) -> Json:
-    """Springs in the colours of their strain, rods without a limit of it; broken ones are grey."""
-    spring_lines = build_spring_lines(who, seen, frames)
-    position = seen.run.position[frames].astype(float)
-    bar = spring_lines.colours()
-    shade = np.clip((spring_lines.strain(position) / spring_lines.limit + 1) / 2, 0, 1)
-    held = np.ones(shade.shape, bool) if spring_lines.held is None else spring_lines.held[frames]
-    return {
-        "kind": "lines",
-        "nodes": position.shape[1],
-        "pairs": pack_frames(spring_lines.pairs.astype(np.int32)),
-        "places": pack_frames(quantise_positions(scenery, position)),
-        "shades": pack_frames(np.round(shade * (COLOUR_COUNT - 1)).astype(np.uint8)),
-        "held": pack_frames(held.astype(np.uint8)),
-        "ramp": (bar.cmap(np.linspace(0, 1, COLOUR_COUNT))[:, :3] * 255).round().astype(int).tolist(),
-        "limit": None if spring_lines.rest is None else 100 * spring_lines.limit,
-    }
-
-
-def _describe_dots(
-    who: str, seen: Dots, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None"
-) -> Json:
-    """Lanes in colours of their own, with their whole paths if there are few of them."""
-    _, trails = build_trails(who, seen.run, 1, cast("ArrayLike | None", color), 0.0)
-    return {
-        "kind": "dots",
-        "nodes": seen.run.position.shape[1],
-        "places": pack_frames(quantise_positions(scenery, seen.run.position[frames].astype(float))),
-        "colors": trails.colours[:, :3].ravel().round(3).tolist(),
-        "paths": seen.run.position.shape[1] <= MAX_DRAWN_LANES,
-    }
-
-
-def _to_hex(color: "ColorType | ArrayLike | None") -> str:
-    from matplotlib.colors import to_hex
-
-    return to_hex("#56B4E9" if color is None else cast("ColorType", color))
+    seen = take_seen(who, film, shown, scene, color)
+    frames, fps = schedule(who, seen.run, fps, speed)
+    pace = Pace(frames, fps, float(speed))
+    return View(describe_run(who, seen, pace, build_scenery(seen.run, frames), color))
 
 
 @cache

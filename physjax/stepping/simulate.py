@@ -67,7 +67,8 @@ def simulate(
         raise TypeError(f"simulate: got a {type(scene).__name__}, expected a Scene.")
     if not callable(method):
         raise TypeError(
-            f"simulate: got the method {method!r}, expected a function (system, t, state, dt) -> state, e.g. methods.rk4."
+            f"simulate: got a {type(method).__name__} as the method, expected a function (system, t, state, dt) -> state, "
+            "e.g. methods.rk4."
         )
     if record is not None and not callable(record):
         raise TypeError(f"record: got {record!r}, expected a function (t, state) -> what to keep.")
@@ -148,10 +149,10 @@ def _step_through(
     """What steps change of a scene, at the end and at every frame behind the first; or what is recorded there."""
     changing = scene.changing()
     arrays, still = eqx.partition(scene, changing)
-    moving = Moving(arrays, _start_memory(scene, method, first_step, dt))
+    moving = Moving(arrays, start_memory(scene, method, first_step, dt))
 
     def step(i: Array, moving: Moving, still: PyTree, dt: Array) -> Moving:
-        scene, memory = _take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
+        scene, memory = take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
         return Moving(eqx.filter(scene, changing), memory)
 
     way = choose_steps(scene, step, moving, still, dt, frame_steps=save_every, cut=record is None, in_kernel=in_kernel)
@@ -180,14 +181,14 @@ def _get_standalone_run(compile_bound: bool, in_kernel: bool) -> Callable[..., T
     return jit_untransformed(run, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
 
 
-def _start_memory(scene: Scene, method: Callable, first_step: Array, dt: ArrayLike) -> PyTree:
+def start_memory(scene: Scene, method: Callable, first_step: Array, dt: ArrayLike) -> PyTree:
     """The memory of a method that goes its own way, where nothing interferes with it; None where there is none."""
     if not isinstance(method, Remembering) or not scene.only_moves:
         return None
     return method.start(scene, moment_at(first_step, dt, scene.state.dtype), scene.state, dt)
 
 
-def _take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike, memory: PyTree) -> tuple[Scene, PyTree]:
+def take_step(scene: Scene, method: Callable, i: Array, dt: ArrayLike, memory: PyTree) -> tuple[Scene, PyTree]:
     """Step number i of a loop, and the memory after it."""
     if scene.compiles_in_pieces:
         scene = scene.replace(state=split_compilation(scene.state, i))
@@ -212,11 +213,11 @@ def sample_states(scene: Scene, method: Callable, dt: ArrayLike, steps_per_frame
         return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), scene.state, states)
     changing = scene.changing()
     arrays, still = eqx.partition(scene, changing)
-    moving = Moving(arrays, _start_memory(scene, method, begun, dt))
+    moving = Moving(arrays, start_memory(scene, method, begun, dt))
 
     def step(i: ArrayLike, moving: Moving) -> Moving:
         i = jnp.asarray(i, jnp.int32)  # a plain number where jit is disabled
-        scene, memory = _take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
+        scene, memory = take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
         return Moving(eqx.filter(scene, changing), memory)
 
     def frame(moving: Moving, index: Array) -> tuple[Moving, PyTree]:

@@ -111,7 +111,7 @@ def test_in_space_bodies_hide_what_is_behind_them_and_in_them():
 def test_the_page_has_the_lines_of_every_frame(film):
     page = animate.view(film, fps=4.0).page()
     data = json.loads(re.search(r'<script type="application/json" id="film">(.*?)</script>', page, re.S)[1])
-    links, dim = data["links"], len(data["low"])
+    links, dim = data["part"]["links"], len(data["low"])
     unpack = lambda text, dtype: np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype)  # noqa: E731
     steps = unpack(links["places"], np.int16).reshape(5, links["nodes"], dim)
     low, high = np.array(data["reach"])

@@ -82,8 +82,8 @@ class Surface(Contact):
             raise ValueError("contact: got friction= (the lecture's K_f) and coulomb=, expected at most one of them.")
         if self.coulomb is not None and not isinstance(self.coulomb, Coulomb):
             raise TypeError(
-                f"coulomb: got {self.coulomb!r}, expected contacts.Coulomb(static=, kinetic=): a contact sticks up to the one "
-                "and slips against the other."
+                f"coulomb: got {self.coulomb!r}, expected contacts.Coulomb(static=0.5, kinetic=0.4): a contact sticks up to the "
+                "one and slips against the other."
             )
         if self.response is not None and not callable(self.response):
             raise TypeError(f"response: got {self.response!r}, expected contacts.impact, contacts.project or None.")

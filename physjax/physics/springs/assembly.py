@@ -12,6 +12,7 @@ from physjax.checks import NestedArrayLike, as_real_quantity
 from physjax.particles import Particles
 from physjax.physics.springs.springs import Springs
 from physjax.physics.springs.wind import Cells, Triangles, Wind
+from physjax.summaries import Row, format_number, format_part, write_summary, write_table
 
 
 class Lattice(NamedTuple):
@@ -31,6 +32,24 @@ class Lattice(NamedTuple):
     nodes: dict[str, np.ndarray]
     faces: np.ndarray
     shape: tuple[int, ...] | None
+
+    def __repr__(self) -> str:
+        """Its size, mass and springs, and the names of its sets of nodes."""
+        return write_summary(*self._describe())
+
+    def _repr_html_(self) -> str:
+        return write_table(*self._describe())
+
+    def _describe(self) -> tuple[str, list[Row]]:
+        nodes, dim = self.state.position.shape[-2:]
+        shape = "" if self.shape is None else f" ({'×'.join(map(str, self.shape))})"
+        rows = [
+            ("mass", f"{format_number(np.sum(np.asarray(self.mass)))} kg"),
+            ("springs", f"{len(self.springs.pairs)}, {format_part(self.springs)}"),
+            ("faces", str(len(self.faces))),
+            ("sets of nodes", ", ".join(f"{name} {int(np.sum(mask))}" for name, mask in self.nodes.items())),
+        ]
+        return f"Lattice: {nodes} nodes{shape} in {dim}-D", rows
 
     def wind(
         self,

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.checks import NestedArrayLike, as_positive_integer, as_real_quantity, unchecked_quantity
 from physjax.loops import Time, to_float_time
@@ -245,6 +245,12 @@ class Springs(Force):
                 f"scenes, (*scenes, {springs}) or (*scenes, 1)."
             )
         return self.topology.spread(number)
+
+    def prepare(self, state: PyTree, mass: PyTree) -> "Springs":
+        """The springs as part of a scene, whose nodes they must join."""
+        if isinstance(state, Particles):
+            self._demand_nodes(state)
+        return self
 
     def _demand_nodes(self, state: Particles) -> None:
         """Raise a ValueError for a state with another number of nodes."""

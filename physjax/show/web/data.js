@@ -1,5 +1,14 @@
 /* What the pages of animate.view have in common: how a film is unpacked, and how its axes are marked. */
-const film = JSON.parse(element("film").textContent);
+let film, middle, size;
+
+/** Take another film; from metres to what is drawn: the middle of the box is the origin, its longest side is 1. */
+function take(next) {
+  film = next;
+  middle = film.low.map((low, i) => (low + film.high[i]) / 2);
+  size = Math.max(...film.high.map((high, i) => high - film.low[i]));
+}
+const drawn = point => point.map((x, i) => (x - middle[i]) / size);
+take(JSON.parse(element("film").textContent));
 
 async function inflated(text) {
   const bytes = Uint8Array.from(atob(text), sign => sign.charCodeAt(0));
@@ -8,15 +17,14 @@ async function inflated(text) {
 
 /** Whole numbers of `Kind`, in rows of `width`, from the differences of the rows; they wrap around as they did. */
 async function numbers(text, Kind, width) {
+  if (typeof text !== "string") return text;  // a film that came as a message has its arrays as they are
   const array = new Kind(await inflated(text));
   for (let i = width; i < array.length; i++) array[i] += array[i - width];
   return array;
 }
 
-/** From metres to what is drawn: the middle of the box is the origin, its longest side is 1. */
-const middle = film.low.map((low, i) => (low + film.high[i]) / 2);
-const size = Math.max(...film.high.map((high, i) => high - film.low[i]));
-const drawn = point => point.map((x, i) => (x - middle[i]) / size);
+/** So few nodes of springs or rods are seen as balls. */
+const FEW_NODES = 40;
 
 /** Places of one frame, as many components for each node as the box has; `hidden` lists nodes that are not to be seen. */
 function unpackPlaces(array, nodes) {
@@ -49,4 +57,30 @@ function showStrainBar(part) {
   const bar = element("bar"), limit = +part.limit.toPrecision(2), colors = part.ramp.filter((_, i) => i % 15 === 0);
   bar.hidden = false;
   bar.innerHTML = `<i style="background:linear-gradient(90deg,${colors.map(c => `rgb(${c})`)})"></i><span><b>\u2212${limit}</b>strain [%]<b>+${limit}</b></span>`;
+}
+
+/** How a film of another box lies in the present one: `scale` and `shift` of its lengths. */
+function fitBox(other) {
+  return { scale: other.size / size, shift: other.middle.map((x, i) => (x - middle[i]) / size) };
+}
+
+/** The frame of a film that is nearest to a time [s]. */
+function frameAt(times, time) {
+  let low = 0, high = times.length - 1;
+  while (low < high) { const half = (low + high) >> 1; if (times[half] < time) low = half + 1; else high = half; }
+  return low && time - times[low - 1] < times[low] - time ? low - 1 : low;
+}
+
+/** Let whoever frames this page show other films in it: {film, ticket, ghost: keep the film before as a pale picture}. */
+function listen(load, control) {
+  addEventListener("message", async event => {
+    if (event.source !== parent || parent === window) return;
+    const { film: next, ghost, ticket, press, theme } = event.data;
+    if (theme) document.documentElement.dataset.theme = theme;
+    if (press) control.press(press);
+    if (!next) return;
+    await load(next, ghost);
+    requestAnimationFrame(() => parent.postMessage({ drawn: ticket }, "*"));
+  });
+  if (parent !== window) parent.postMessage({ ready: true }, "*");
 }

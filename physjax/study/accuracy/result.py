@@ -10,6 +10,7 @@ import numpy as np
 
 from physjax.files import write_atomically
 from physjax.show.style import AS_GIVEN, PROJECTED
+from physjax.summaries import format_number, write_grid, write_summary
 from physjax.text import format_seconds, format_table
 
 if TYPE_CHECKING:
@@ -96,6 +97,29 @@ class WorkPrecision(NamedTuple):
     horizon: float = math.inf
     batch: int = 1
     gradients: tuple[Run, ...] = ()
+
+    def __repr__(self) -> str:
+        """Each method with its best error and what that took."""
+        return write_summary(self._title(), [(name, ", ".join(cells)) for name, *cells in self._rows()])
+
+    def _repr_html_(self) -> str:
+        return write_grid(self._title(), ("method", "smallest error", "time", "runs"), self._rows())
+
+    def _title(self) -> str:
+        whose = self.name or "a scene"
+        return f"WorkPrecision of {whose}: {len(self.runs)} runs over {format_seconds(self.duration)}, {self.dtype}"
+
+    def _rows(self) -> list[tuple[str, str, str, str]]:
+        rows = []
+        for name in self.methods:
+            runs = [run for run in self.of(name) if run.status == "ok"]
+            if not runs:
+                rows.append((name, "no run is ok", "-", f"{len(self.of(name))} runs"))
+                continue
+            best = min(runs, key=lambda run: run.path_error)
+            error = f"error {format_number(best.path_error)} of the path"
+            rows.append((name, error, f"in {format_seconds(best.seconds)}", f"{len(self.of(name))} runs"))
+        return rows
 
     @property
     def methods(self) -> tuple[str, ...]:

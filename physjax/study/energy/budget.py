@@ -88,6 +88,10 @@ class Ledger(NamedTuple):
         kept = {"energy": self.energy, "momentum": self.momentum, "angular momentum": self.angular_momentum}
         return {name: account for name, account in kept.items() if account is not None}
 
+    def __repr__(self) -> str:
+        """The totals that are printed."""
+        return f"<Ledger: {self}>"
+
     def __str__(self) -> str:
         labels = list(dict.fromkeys(name for account in self.accounts.values() for name in account.received))
         headers, columns = ["received by", *(f"{name} [{a.unit}]" for name, a in self.accounts.items())], []

@@ -71,7 +71,7 @@ def momentum(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
         [6. 8.]
     """
     p = state.linear_momentum(scene.mass)
-    return jnp.sum(p, axis=-2) if scene.couples else p
+    return jnp.sum(p, axis=-2) if scene.couples and scene.state.lanes else p
 
 
 def angular_momentum(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, "..."]:
@@ -86,7 +86,7 @@ def angular_momentum(scene: Scene, t: ArrayLike, state: PyTree) -> Float[Array, 
         arms = r[..., 0] * p[..., 1] - r[..., 1] * p[..., 0]
         return summed(scene, arms + state.own_spin(scene.mass) if state.rotates else arms)
     spin = cross(r, p) + state.own_spin(scene.mass) if state.rotates else cross(r, p)
-    return jnp.sum(spin, axis=-2) if scene.couples else spin
+    return jnp.sum(spin, axis=-2) if scene.couples and scene.state.lanes else spin
 
 
 def _angular_momentum_size(scene: Scene, state: PyTree) -> Array:
@@ -98,13 +98,13 @@ def _angular_momentum_size(scene: Scene, state: PyTree) -> Array:
 
 
 def summed(scene: Scene, per_lane: Array) -> Array:
-    """Numbers per lane, summed over coupled lanes.
+    """Numbers per lane, summed over coupled lanes; a plain force on a single particle couples nothing.
 
     Example:
         >>> float(energy.summed(flag, jnp.ones(9))), energy.summed(shot, jnp.ones(3)).tolist()
         (9.0, [1.0, 1.0, 1.0])
     """
-    return jnp.sum(per_lane, axis=-1) if scene.couples else per_lane
+    return jnp.sum(per_lane, axis=-1) if scene.couples and jnp.ndim(per_lane) else per_lane
 
 
 ENERGY = Conserved("energy", total, kinetic)

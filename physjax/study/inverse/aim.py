@@ -39,6 +39,7 @@ from physjax.study.inverse.shooting import (
     guess_launch,
     select_where,
 )
+from physjax.summaries import Row, format_array, write_grid, write_summary, write_table
 from physjax.trajectory import Trajectory
 from physjax.vectors import components, dot, norm, stack_components
 
@@ -72,6 +73,26 @@ class Shot(NamedTuple):
     residual: Float[Array, "*lanes dim"]
     ok: Bool[Array, "*lanes"]
 
+    def __repr__(self) -> str:
+        """Its angle, speed, time, apex and miss."""
+        return write_summary("Shot", self.describe())
+
+    def _repr_html_(self) -> str:
+        return write_table("Shot", self.describe())
+
+    def describe(self) -> list[Row]:
+        """What a summary says of it."""
+        azimuth = [] if self.azimuth is None else [("azimuth", format_array(self.azimuth, "rad"))]
+        return [
+            ("angle", format_array(self.angle, "rad")),
+            *azimuth,
+            ("speed", format_array(self.speed, "m/s")),
+            ("time", format_array(self.time, "s")),
+            ("apex", format_array(self.apex, "m")),
+            ("misses by", format_array(self.miss, "m")),
+            ("hits", format_array(self.ok)),
+        ]
+
     @property
     def miss(self) -> Float[Array, "*lanes"]:
         """Distance from the target at the end of the flight [m]: rounding where it hits."""
@@ -87,6 +108,19 @@ class Aimed(eqx.Module):
     low: Shot
     high: Shot
     shots: AimProblem
+
+    def __repr__(self) -> str:
+        """Both arcs, side by side."""
+        low, high = self.low.describe(), self.high.describe()
+        rows = [(name, f"{a:<22}  {b}") for (name, a), (_, b) in zip(low, high, strict=True)]
+        return write_summary(self._title(), [("", f"{'low arc':<22}  high arc"), *rows])
+
+    def _repr_html_(self) -> str:
+        rows = [(name, a, b) for (name, a), (_, b) in zip(self.low.describe(), self.high.describe(), strict=True)]
+        return write_grid(self._title(), ("", "low arc", "high arc"), rows)
+
+    def _title(self) -> str:
+        return f"Aimed at {format_array(self.target, 'm')}"
 
     @property
     def ok(self) -> Bool[Array, "*lanes"]:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import as_positive_integer, as_real_array, as_real_quantity, concrete_or_none, demand_all
 from physjax.compiling import announce_compiling
+from physjax.summaries import Row, format_array, format_tree, write_summary, write_table
 
 MAX_NEWTON_STEPS = 8
 """Newton steps at most from where the safe search ended to the last digits."""
@@ -31,6 +32,13 @@ class Solution(NamedTuple):
     ok: Bool[Array, ""]
     steps: Int[Array, ""]
 
+    def __repr__(self) -> str:
+        """The unknown, the residual and the effort."""
+        return write_summary("Solution", _describe(self, "residual", self.residual))
+
+    def _repr_html_(self) -> str:
+        return write_table("Solution", _describe(self, "residual", self.residual))
+
 
 class Minimum(NamedTuple):
     """The unknown, the cost there, whether the search ended in a minimum, and its steps."""
@@ -39,6 +47,18 @@ class Minimum(NamedTuple):
     cost: Float[Array, ""]
     ok: Bool[Array, ""]
     steps: Int[Array, ""]
+
+    def __repr__(self) -> str:
+        """The unknown, the cost and the effort."""
+        return write_summary("Minimum", _describe(self, "cost", self.cost))
+
+    def _repr_html_(self) -> str:
+        return write_table("Minimum", _describe(self, "cost", self.cost))
+
+
+def _describe(found: Solution | Minimum, name: str, size: PyTree) -> list[Row]:
+    rows = [("value", format_tree(found.value)), (name, format_tree(size)), ("steps", format_array(found.steps))]
+    return [*rows, ("ok", format_array(found.ok))]
 
 
 @announce_compiling("solve")

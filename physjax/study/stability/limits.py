@@ -83,6 +83,10 @@ class Limit(NamedTuple):
     node: tuple[int, ...]
     rate: complex
 
+    def __repr__(self) -> str:
+        """The sentence that is printed."""
+        return f"<Limit: {self}>"
+
     def __str__(self) -> str:
         if self.cause == "nothing":
             return f"{self.method}: any step is stable, nothing swings or decays"

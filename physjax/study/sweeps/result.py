@@ -15,6 +15,7 @@ from jaxtyping import PyTree
 from physjax.files import read_arrays, write_atomically
 from physjax.study.sweeps import store as chunks
 from physjax.study.sweeps.design import DESIGNS, Axis, Lanes, leaf_name
+from physjax.summaries import Row, format_array, format_tree, write_summary, write_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +41,7 @@ class Best(NamedTuple):
         return ": ".join(", ".join(f"{name} = {np.asarray(value)}" for name, value in part.items()) for part in parts)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
     """The results of a sweep. `axes` are the swept values by name; `shape` is that of the results, an axis each.
 
@@ -54,6 +55,21 @@ class Sweep:
     reasons: tuple[str, ...]
     source: Callable[[], dict[str, np.ndarray]] = field(repr=False)
     rebuild: Callable[[list[np.ndarray]], PyTree] | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        """Its axes, what was measured, and what failed."""
+        return write_summary(*self._describe())
+
+    def _repr_html_(self) -> str:
+        return write_table(*self._describe())
+
+    def _describe(self) -> tuple[str, list[Row]]:
+        rows = [(name, format_tree(values)) for name, values in self.axes.items()]
+        rows += [("->  " + name.removeprefix("value."), format_array(array)) for name, array in self.arrays.items()]
+        codes, counts = np.unique(self.status, return_counts=True)
+        reason = lambda code: MISSING_REASON if code < 0 else self.reasons[code]  # noqa: E731
+        status = ", ".join(f"{n} {reason(code)}" for code, n in zip(codes.tolist(), counts.tolist(), strict=True))
+        return f"Sweep: {'×'.join(map(str, self.shape))} points, {self.lanes.design}", [*rows, ("status", status)]
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the results themselves, wherever they are kept."""

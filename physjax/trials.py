@@ -1,0 +1,93 @@
+"""A force of the user is tried once while its scene is built: what is wrong with it is said there, in a few lines.
+
+It is traced and not compiled, a millisecond or two; a function that was tried with states of the same shapes is not tried again.
+"""
+
+import inspect
+from collections.abc import Callable, Iterable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from physjax.backend import jit_is_disabled
+from physjax.particles import callable_name
+from physjax.parts import Function, holds_user_code
+
+MAX_REMEMBERED_TRIALS = 4096
+"""Trials that are remembered; then all are forgotten."""
+EXAMPLE = "A force is (t, state, mass) -> newtons, e.g. def drag(t, state, mass): return -0.1 * state.velocity"
+"""What a force looks like, for messages."""
+_tried: set[tuple] = set()
+
+
+def find_faulty_force(state: PyTree, mass: PyTree, forces: Iterable[Callable]) -> str | None:
+    """The name of the first force that cannot be evaluated, or has another shape, and what it must be; None where all work.
+
+    Errors that are its own, such as a name that is not defined, are raised as they are. Not where `jit` is disabled, so
+    that a debugger meets real numbers alone.
+    """
+    faults = (_try_force(state, mass, force) for force in forces if not jit_is_disabled() and holds_user_code(force))
+    return next(filter(None, faults), None)
+
+
+def _try_force(state: PyTree, mass: PyTree, force: Callable) -> str | None:
+    key = _describe_structure((force, state, mass))
+    if key in _tried:
+        return None
+    fault = _find_fault(state, mass, force)
+    if fault is not None:
+        return f"force {callable_name(force)}: {fault}\n{EXAMPLE}"
+    if len(_tried) >= MAX_REMEMBERED_TRIALS:
+        _tried.clear()
+    _tried.add(key)
+    return None
+
+
+def _describe_structure(tree: PyTree) -> tuple:
+    arrays, structure = jax.tree.flatten(eqx.filter(tree, eqx.is_array_like))
+    return structure, tuple((jnp.shape(array), jnp.result_type(array)) for array in arrays)
+
+
+def _find_fault(state: PyTree, mass: PyTree, force: Callable) -> str | None:
+    """What is wrong with a force; None where nothing is."""
+    fault = _find_wrong_arguments(force)
+    if fault is not None:
+        return fault
+    try:
+        time = jax.ShapeDtypeStruct((), state.dtype)
+        jax.eval_shape(lambda t, state, mass: state.evaluate_load(force, t, mass), time, state, mass)
+    except jax.errors.TracerBoolConversionError:
+        return (
+            "decides by a number that is not known yet (`if`, `while`, `and`, `max`).\n"
+            "Write jnp.where(condition, a, b) in place of `if`, & in place of `and`, jnp.maximum in place of max."
+        )
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
+        return (
+            "asks for a number that is not known yet: NumPy and math, float() and int() cannot be given traced ones.\n"
+            "Write jnp.sin in place of np.sin and math.sin, and leave float() and int() out."
+        )
+    except TypeError as error:
+        text = str(error)
+        if not text.startswith("force "):
+            raise
+        return text.partition(": ")[2]
+    return None
+
+
+def _find_wrong_arguments(force: Callable) -> str | None:
+    """Whether a force takes other arguments than three."""
+    function = force.function if isinstance(force, Function) else force
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # made in C: it has none
+        return None
+    try:
+        signature.bind(0.0, None, None)
+    except TypeError:
+        return f"takes {signature}, expected the three arguments (t, state, mass)."
+    return None
+
+
+__all__ = ["find_faulty_force"]
