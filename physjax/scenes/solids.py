@@ -32,12 +32,12 @@ def stack_in_space(count: int = 10, g: float = 9.8) -> Problem:
 
 
 @scene
-def pyramid_in_space(layers: int = 4, gap: float = 0.05, g: float = 9.8) -> Problem:
+def pyramid_in_space(rows: int = 4, spacing: float = 0.05, g: float = 9.8) -> Problem:
     """Thirty boxes in four layers of 4 x 4 to 1, each on four of the layer below: the pyramid stands."""
-    sides = range(layers, 0, -1)
-    level = np.concatenate([np.full(n * n, layers - n) for n in sides])
+    sides = range(rows, 0, -1)
+    level = np.concatenate([np.full(n * n, rows - n) for n in sides])
     cell = np.concatenate([np.indices((n, n)).reshape(2, -1).T - (n - 1) / 2 for n in sides])
-    place = np.stack([(1 + gap) * cell[:, 0], level + 0.5, (1 + gap) * cell[:, 1]], axis=-1)
+    place = np.stack([(1 + spacing) * cell[:, 0], level + 0.5, (1 + spacing) * cell[:, 1]], axis=-1)
     above = (np.abs(place[:, None] - place) < [1.0, 1.5, 1.0]).all(axis=-1) & (level[:, None] != level)
     return _build_pile(place, g, np.argwhere(np.triu(above, 1)), slack=2e-3, still=1e-4)
 
