@@ -15,12 +15,12 @@ from physjax.checks import as_positive_integer, as_real_quantity
 from physjax.physics.springs.assembly import Lattice
 from physjax.physics.springs.rods import Distances
 from physjax.physics.springs.springs import Springs
+from physjax.show.bodies import BodyShapes, prepare_bodies
 from physjax.show.films import Film, schedule
 from physjax.show.frames import get_faces, take_frames, take_lanes
 from physjax.show.lines import take_lines
 from physjax.show.panels import build_scenery
 from physjax.show.particles import prepare_particles
-from physjax.show.solids import BodyShapes, prepare_bodies
 from physjax.show.spring_lines import build_spring_lines, choose_strain_bar, draw_springs
 from physjax.show.surfaces import draw_surface
 from physjax.show.trails import build_trail_scenery, build_trails

@@ -1,8 +1,8 @@
 """Runs for Blender, engines and other programs: animated glTF, and PLY files frame by frame. `Trajectory.save` writes NPZ.
 
 `shown` says what a run is exported as, as in `animate.view`: a lattice with faces, springs, a `solids` shape or one for
-each body. Without it bodies are boxes of their inertia, in the plane the shapes of the scene's `rigid.Solids`, and nodes
-are joined by the springs of the scene.
+each body. Without it bodies are the shapes of the scene's `rigid.Solids` or boxes of their inertia, and nodes are joined by
+the springs of the scene. Rods and ropes between bodies are lines.
 
 Metres. glTF has y up, and its root node turns a scene with another axis up; PLY has the axes of the scene. In the plane
 z is 0.
@@ -11,16 +11,20 @@ z is 0.
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from physjax.files import write_atomically, write_folder_atomically
+from physjax.show.bodies import choose_body_colours
 from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
 from physjax.show.frames import Frames
 from physjax.show.gltf import LINES, POINTS, TRIANGLES, Document, Json
 from physjax.show.lines import Lines
+from physjax.show.links import LINK_LOOK, Links
+from physjax.show.page_data import number_shapes
 from physjax.show.pages import check_output_path
 from physjax.text import progress_bar
 from physjax.trajectory import Trajectory
@@ -45,7 +49,7 @@ def gltf(
     shown: Look | None = None,
     *,
     scene: int | Sequence[int] | None = None,
-    color: "ColorType" = DEFAULT_COLOR,
+    color: "ColorType | ArrayLike | None" = None,
     fps: int | float = 30.0,
     speed: int | float = 1.0,
     progress: bool = True,
@@ -54,10 +58,11 @@ def gltf(
 
     Bodies are nodes that move and turn. A cloth, springs and dots have a morph target for each frame, linear in between:
     12 bytes a node and frame, no normals, at most 240 frames and 1 GiB. The file plays `speed` seconds of the run a
-    second, in `fps` frames. `color` is one for all. Numbers are float32.
+    second, in `fps` frames. `color` is one for all, or a value for each body. Numbers are float32.
 
     Raises TypeError or ValueError for what does not fit, too many frames among them (choose a lower `fps`, a higher
-    `speed`, or `export.ply`), lanes that blew up, and springs that break, since glTF cannot remove a line.
+    `speed`, or `export.ply`), lanes that blew up, and springs that break, since glTF cannot remove a line of a mesh. Rods
+    and ropes between bodies have a node each, which shrinks to nothing where they break.
 
     Example:
         >>> from physjax.show import solids
@@ -79,10 +84,13 @@ def gltf(
         )
     document = Document(seen.run.up if seen.run.dim == 3 else 1)
     times = document.accessor(np.arange(len(frames)) / fps)
-    material = document.material(_to_rgb(color))
     if isinstance(seen, Bodies):
-        _add_bodies(document, seen, place, frames, times, material)
+        colours = choose_body_colours(who, film, color, len(seen.shapes))
+        _add_bodies(document, seen, colours, place, frames, times)
+        if seen.links is not None:
+            _add_links(document, seen.links, frames, times)
     else:
+        material = document.material(_to_rgb(DEFAULT_COLOR if color is None else cast("ColorType", color)))
         _add_morphing(document, seen, _track_progress(place, progress), times, material)
     with write_atomically(path, "wb") as file:
         file.write(document.bytes())
@@ -114,32 +122,71 @@ def ply(
     folder = Path(folder)
     seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
     seen = seen.solids() if isinstance(seen, PlanarFigures) else seen
+    links = seen.links if isinstance(seen, Bodies) else None
     seen = seen.surface() if isinstance(seen, Bodies) else seen
     frames, fps = schedule(who, seen.run, fps, speed)
-    held = seen.held if isinstance(seen, Lines) else None
+    edges = seen.pairs if isinstance(seen, Lines) else None if links is None else links.list_pairs(seen.run)
+    held = seen.held if isinstance(seen, Lines) else None if links is None else links.held
     digits = max(4, len(str(len(frames))))
     names = [f"frame_{number:0{digits}d}.ply" for number in range(len(frames))]
     with write_folder_atomically(folder) as inside:
         for name, frame in _track_progress(list(zip(names, frames, strict=True)), progress):
-            intact = None if held is None else held[frame]
-            code = _encode_ply(seen, _pad_to_three(seen.run.position[frame]), intact, seen.run.time[frame])
+            intact = edges if edges is None or held is None else edges[held[frame]]
+            faces = seen.faces if isinstance(seen, Surface) else None
+            code = _encode_ply(_pad_to_three(seen.run.position[frame]), faces, intact, seen.run.time[frame])
             (inside / name).write_bytes(code)
     return [folder / name for name in names]
 
 
-def _add_bodies(document: Document, seen: Bodies, place: np.ndarray, frames: list[int], times: int, look: int) -> None:
-    """A mesh for each different shape, and a node for each body."""
+def _add_bodies(
+    document: Document, seen: Bodies, colours: np.ndarray, place: np.ndarray, frames: list[int], times: int
+) -> None:
+    """The arrays of each shape that differs, a mesh for each of these in a colour, and a node for each body."""
     turn = np.roll(_align_quaternion_signs(seen.orientation[frames]), -1, axis=-1)
-    meshes: dict[bytes, int] = {}
-    for body, shape in enumerate(seen.shapes):
-        same = shape.vertices.tobytes() + shape.faces.tobytes()
-        if same not in meshes:
-            what = {"attributes": {"POSITION": document.vertices(shape.vertices)}, "mode": TRIANGLES, "material": look}
-            meshes[same] = document.mesh(what | {"indices": document.indices(shape.faces)})
+    numbers, different = number_shapes(seen.shapes)
+    arrays = [
+        {"attributes": {"POSITION": document.vertices(shape.vertices)}, "indices": document.indices(shape.faces)}
+        for shape in different
+    ]
+    looks: dict[tuple[float, ...], int] = {}
+    meshes: dict[tuple[int, int], int] = {}
+    for body, number in enumerate(numbers):
+        rgb = tuple(colours[body, :3].tolist())
+        look = looks[rgb] if rgb in looks else looks.setdefault(rgb, document.material(rgb))
+        if (number, look) not in meshes:
+            meshes[number, look] = document.mesh(arrays[number] | {"mode": TRIANGLES, "material": look})
         stands = {"translation": place[0, body].tolist(), "rotation": turn[0, body].tolist()}
-        node = document.node(name=f"body {body}", mesh=meshes[same], **stands)
+        node = document.node(name=f"body {body}", mesh=meshes[number, look], **stands)
         document.animate(node, "translation", times, document.accessor(place[:, body]))
         document.animate(node, "rotation", times, document.accessor(turn[:, body]))
+
+
+def _add_links(document: Document, links: Links, frames: list[int], times: int) -> None:
+    """One mesh, a line from the origin to (1, 0, 0), and a node for each link that puts, turns and stretches it."""
+    line = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    what: Json = {"attributes": {"POSITION": document.vertices(line)}, "mode": LINES}
+    mesh = document.mesh(what | {"material": document.material(_to_rgb(LINK_LOOK["colors"]))})
+    start, end = np.moveaxis(links.ends[frames], 2, 0)
+    way = end - start
+    length = np.sqrt((way * way).sum(axis=-1, keepdims=True))
+    turn = np.roll(_align_quaternion_signs(_turn_from_x(way / np.where(length > 0, length, 1.0))), -1, axis=-1)
+    scale = np.where(links.held[frames][..., None], length, 0.0) * [1.0, 0.0, 0.0] + [0.0, 1.0, 1.0]
+    for link in range(start.shape[1]):
+        moves = {"translation": start[:, link], "rotation": turn[:, link], "scale": scale[:, link]}
+        node = document.node(
+            name=f"link {link}", mesh=mesh, **{path: values[0].tolist() for path, values in moves.items()}
+        )
+        for path, values in moves.items():
+            document.animate(node, path, times, document.accessor(values))
+
+
+def _turn_from_x(direction: np.ndarray) -> np.ndarray:
+    """Unit quaternions (w, x, y, z) that turn the x axis to unit vectors `(..., 3)`, the short way."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    found = np.stack([1 + x, np.zeros_like(x), -z, y], axis=-1)
+    # straight back: half a turn about y
+    found = np.where(1 + x[..., None] > 1e-12, found, [0.0, 0.0, 1.0, 0.0])
+    return found / np.sqrt((found * found).sum(axis=-1, keepdims=True))
 
 
 def _add_morphing(
@@ -158,22 +205,23 @@ def _add_morphing(
     document.animate(node, "weights", times, document.accessor(weights.ravel()))
 
 
-def _encode_ply(seen: Surface | Lines | Dots, place: np.ndarray, held: np.ndarray | None, time: float) -> bytes:
-    """The bytes of a file with one frame; of springs those that are `held`."""
+def _encode_ply(place: np.ndarray, faces: np.ndarray | None, edges: np.ndarray | None, time: float) -> bytes:
+    """The bytes of a file with one frame; without faces and edges, of the places that are finite."""
     vertices = place.astype("<f4")
+    if faces is None and edges is None:
+        vertices = vertices[np.isfinite(vertices).all(axis=-1)]
     header = ["ply", "format binary_little_endian 1.0", f"comment t = {time:.9g} s"]
-    tables = []
-    if isinstance(seen, Surface):
-        table = np.empty(len(seen.faces), [("count", "u1"), ("corners", "<i4", (3,))])
-        table["count"], table["corners"] = 3, seen.faces
-        tables = [f"element face {len(table)}", "property list uchar int vertex_indices"]
-    elif isinstance(seen, Lines):
-        table = np.asarray(seen.pairs if held is None else seen.pairs[held], "<i4")
-        tables = [f"element edge {len(table)}", "property int vertex1", "property int vertex2"]
-    else:
-        vertices, table = vertices[np.isfinite(vertices).all(axis=-1)], np.empty(0)
-    header += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz"), *tables, "end_header"]
-    return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + table.tobytes()
+    header += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
+    body = vertices.tobytes()
+    if faces is not None:
+        table = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", (3,))])
+        table["count"], table["corners"] = 3, faces
+        header += [f"element face {len(table)}", "property list uchar int vertex_indices"]
+        body += table.tobytes()
+    if edges is not None:
+        header += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2"]
+        body += np.asarray(edges, "<i4").tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode("ascii") + body
 
 
 def _require_finite_positions(who: str, run: Frames, frames: list[int]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """What the page of `animate.view` is made from where a run is in the plane: bodies as outlines, and surfaces as lines."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -10,9 +10,9 @@ from physjax.parts import Contact
 from physjax.physics.rigid.planar import PlanarShape
 from physjax.show import level_sets
 from physjax.show.frames import Frames
-from physjax.show.page_data import Json, quantise_positions
+from physjax.show.page_data import Json, number_shapes, quantise_positions, to_hexes
 from physjax.show.panels import Scenery
-from physjax.show.planar import EDGE_BRIGHTNESS, PlanarOutline, PlanarPicture, build_planar_outline, take_planar_bodies
+from physjax.show.planar import EDGE_BRIGHTNESS, PlanarPicture, build_planar_outline, take_planar_bodies
 from physjax.show.stage import Stage
 from physjax.trajectory import Trajectory
 
@@ -45,15 +45,15 @@ def take_flat_bodies(
         ahead = picture.tips - picture.place
         angle, length = np.arctan2(ahead[..., 1], ahead[..., 0]), float(np.nanmax(np.hypot(*np.moveaxis(ahead, -1, 0))))
         outlines = [build_planar_outline(PlanarShape.disc(length / 2))] * angle.shape[1]
-    numbers, different = _number_outlines(outlines)
+    numbers, different = number_shapes(outlines)
     dark = picture.colours[:, :3] * EDGE_BRIGHTNESS
     return seen, {
         "kind": "bodies",
         "nodes": angle.shape[1],
         "places": picture.place,
         "angles": angle,
-        "colors": _to_hexes(picture.colours[:, :3]),
-        "edges": _to_hexes(dark),
+        "colors": to_hexes(picture.colours),
+        "edges": to_hexes(dark),
         "shape": numbers,
         "shapes": [{"corners": outline.corners.tolist(), "mark": outline.line.tolist()} for outline in different],
     }
@@ -115,17 +115,3 @@ def _straighten(points: np.ndarray, stage: Stage) -> list[list[float]]:
             legs += [(start, start + 1 + worst), (start + 1 + worst, end)]
     decimals = int(6 - np.floor(np.log10(stage.size)))
     return np.round(points[kept], decimals).tolist()
-
-
-def _number_outlines(outlines: Sequence[PlanarOutline]) -> tuple[list[int], list[PlanarOutline]]:
-    """The number of the outline of each body, and the outlines that differ."""
-    keys = [outline.corners.tobytes() + outline.line.tobytes() for outline in outlines]
-    first = {key: outline for key, outline in zip(keys, outlines, strict=True)}
-    order = {key: number for number, key in enumerate(first)}
-    return [order[key] for key in keys], list(first.values())
-
-
-def _to_hexes(colours: np.ndarray) -> list[str]:
-    from matplotlib.colors import to_hex
-
-    return [to_hex(cast("ColorType", tuple(colour))) for colour in colours]

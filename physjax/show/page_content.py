@@ -9,11 +9,22 @@ from jax.typing import ArrayLike
 from physjax.parts import Contact
 from physjax.physics.rigid.planar import PlanarBodies
 from physjax.show import obstacles
+from physjax.show.bodies import choose_body_colours
 from physjax.show.drawables import Bodies, Dots, Drawable, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.flat_page import CONTOUR_POINTS, describe_flat_obstacle, quantise_flat_bodies, take_flat_bodies
 from physjax.show.frames import Frames
 from physjax.show.lines import Lines
-from physjax.show.page_data import QUANTISATION_STEPS, Json, build_padded_box, describe_obstacle, quantise_positions
+from physjax.show.links import Links
+from physjax.show.page_data import (
+    QUANTISATION_STEPS,
+    Json,
+    build_padded_box,
+    describe_links,
+    describe_obstacle,
+    number_shapes,
+    quantise_positions,
+    to_hexes,
+)
 from physjax.show.panels import Scenery
 from physjax.show.plot import MAX_DRAWN_LANES
 from physjax.show.spring_lines import build_spring_lines
@@ -37,11 +48,20 @@ class Pace(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """A run as it is drawn: the record of its frames, bodies in the plane as a part of the page, and what is drawn."""
+    """A run as it is drawn: the record of its frames, bodies in the plane as a part of the page, and what is drawn.
+
+    `colours` are those of bodies in space, `(bodies, 4)`.
+    """
 
     run: Frames
     bodies: Json
     drawn: Drawable
+    colours: np.ndarray | None = None
+
+    @property
+    def links(self) -> Links | None:
+        """The rods and ropes between bodies."""
+        return self.drawn.links if isinstance(self.drawn, Bodies | PlanarFigures) else None
 
 
 def take_seen(
@@ -55,8 +75,12 @@ def take_seen(
     seen = choose_drawable(who, film, shown, scene, dims=(2, 3))
     if isinstance(film.state, PlanarBodies) and isinstance(seen, PlanarFigures | Dots):
         shapes = seen.shapes if isinstance(seen, PlanarFigures) else None
-        return Seen(*take_flat_bodies(who, film, shapes, color), seen)
-    return Seen((seen.surface() if isinstance(seen, Bodies) else seen).run, {}, seen)
+        run, bodies = take_flat_bodies(who, film, shapes, color)
+        links = seen.links if isinstance(seen, PlanarFigures) else None
+        return Seen(run if links is None else links.add_nodes(run), bodies, seen)
+    if isinstance(seen, Bodies):
+        return Seen(seen.surface().run, {}, seen, choose_body_colours(who, film, color, len(seen.shapes)))
+    return Seen(seen.run, {}, seen)
 
 
 def describe_run(
@@ -77,11 +101,14 @@ def describe_run(
     elif isinstance(seen.drawn, Surface):
         part = _describe_surface(seen.drawn, scenery, frames, color)
     elif isinstance(seen.drawn, Bodies):
-        part = _describe_bodies(seen.drawn, scenery, frames, color)
+        assert seen.colours is not None
+        part = _describe_bodies(seen.drawn, scenery, frames, seen.colours)
     elif isinstance(seen.drawn, Lines):
         part = _describe_lines(who, seen.drawn, scenery, frames)
     else:
         part = _describe_dots(who, cast("Dots", seen.drawn), scenery, frames, color)
+    if seen.links is not None:
+        part |= {"links": describe_links(seen.links, scenery, frames)}
     describe = describe_surface or describe_contact
     return {
         "frames": frames,
@@ -119,16 +146,18 @@ def _describe_surface(
     }
 
 
-def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], color: "ColorType | ArrayLike | None") -> Json:
-    """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape."""
+def _describe_bodies(seen: Bodies, scenery: Scenery, frames: list[int], colours: np.ndarray) -> Json:
+    """Centres, quaternions (x, y, z, w), which keep shapes rigid, and the triangles of each shape that differs."""
     turn = np.roll(seen.orientation[frames], -1, axis=-1)
+    numbers, different = number_shapes(seen.shapes)
     return {
         "kind": "bodies",
-        "color": _to_hex(color),
+        "colors": to_hexes(colours),
         "nodes": seen.run.position.shape[1],
         "places": quantise_positions(scenery, seen.run.position[frames].astype(float)),
         "turns": np.round(turn * QUANTISATION_STEPS).astype(np.int16),
-        "shapes": [{"vertices": s.vertices.ravel().tolist(), "faces": s.faces.ravel().tolist()} for s in seen.shapes],
+        "shape": numbers,
+        "shapes": [{"vertices": s.vertices.ravel().tolist(), "faces": s.faces.ravel().tolist()} for s in different],
     }
 
 

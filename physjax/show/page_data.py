@@ -2,16 +2,22 @@
 
 import base64
 import zlib
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
 from physjax.parts import Contact
 from physjax.show import level_sets, outlines
+from physjax.show.links import Links
 from physjax.show.outlines import Outline
 from physjax.show.panels import Scenery
 from physjax.show.stage import EDGE_SLACK_SHARE
 
+if TYPE_CHECKING:
+    from matplotlib.typing import ColorType
+
+T = TypeVar("T", bound=tuple)
 Json = dict[str, Any]
 """An object of the page's JSON; arrays in it are sent as `pack_arrays` writes them."""
 QUANTISATION_STEPS = 32767
@@ -52,6 +58,31 @@ def build_padded_box(scenery: Scenery) -> tuple[np.ndarray, np.ndarray]:
     """The corners of a box that is a little larger than what counts as inside of the stage, so that no step is lost."""
     slack = (EDGE_SLACK_SHARE + 0.01) * scenery.stage.size
     return scenery.stage.low - slack, scenery.stage.high + slack
+
+
+def number_shapes(shapes: Sequence[T]) -> tuple[list[int], list[T]]:
+    """The number of the shape of each body, and the shapes that differ: tuples of two arrays."""
+    keys = [b"".join(np.asarray(part).tobytes() for part in shape) for shape in shapes]
+    first = {key: shape for key, shape in zip(keys, shapes, strict=True)}
+    order = {key: number for number, key in enumerate(first)}
+    return [order[key] for key in keys], list(first.values())
+
+
+def to_hexes(colours: np.ndarray) -> list[str]:
+    """Colours `(n, 3)` or with an opacity, which is left out, as the web writes them."""
+    from matplotlib.colors import to_hex
+
+    return [to_hex(cast("ColorType", tuple(colour[:3]))) for colour in colours]
+
+
+def describe_links(links: Links, scenery: Scenery, frames: list[int]) -> Json:
+    """The ends of lines between bodies, one after the other, and which lines are intact."""
+    ends = links.ends[frames].reshape(len(frames), -1, links.ends.shape[-1])
+    return {
+        "nodes": ends.shape[1],
+        "places": quantise_positions(scenery, ends),
+        "held": links.held[frames].astype(np.uint8),
+    }
 
 
 def describe_obstacle(contact: Contact, scenery: Scenery, frames: list[int]) -> Json:

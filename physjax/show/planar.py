@@ -95,15 +95,12 @@ def find_planar_shapes(film: Trajectory) -> list[PlanarShape] | None:
     if scene is None:
         return None
     *worlds, bodies = scene.state.lanes or (1,)
-    solids = [contact for contact in scene.contacts if isinstance(contact, Solids)]
-    joints = [part for part in scene.constraints if isinstance(part, BodyJoints)]
-    if not solids and not joints:
+    solids = (contact for contact in scene.contacts if isinstance(contact, Solids))
+    given = [shape for contact in solids for shape in contact.shapes if isinstance(shape, PlanarShape)]
+    joints = [part for part in scene.constraints if isinstance(part, BodyJoints) and part.points.shape[-1] == 2]
+    if not given and not joints:
         return None
-    shapes = (
-        [shape for shape in solids[0].shapes if isinstance(shape, PlanarShape)]
-        if solids
-        else [_build_bar(joints, body) for body in range(bodies)]
-    )
+    shapes = given or [_build_bar(joints, body) for body in range(bodies)]
     return (shapes * bodies if len(shapes) == 1 else shapes) * int(np.prod(worlds, dtype=int))
 
 

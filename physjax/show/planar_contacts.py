@@ -1,6 +1,5 @@
 """Contacts of solids in the plane: a dot at each point that touches, and arrows of the forces that bodies press with."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -57,17 +56,6 @@ class ContactMarks(NamedTuple):
         look = {"angles": "xy", "scale_units": "xy", "units": "dots", "width": 1.6, "zorder": 5, "color": FORCE_COLOUR}
         ends = (*self.starts[frame].T, *self.forces[frame].T)
         return [dots, ax.quiver(*ends, scale=self.newtons_per_metre, **look)]
-
-
-class MarkedBodies(NamedTuple):
-    """Draws frames of bodies in the plane, and the marks of their contacts on top."""
-
-    bodies: Callable
-    marks: ContactMarks
-
-    def __call__(self, ax: "Axes", scenery: Scenery, frame: int) -> "list[Artist]":
-        """Draw a frame into axes in the plane."""
-        return [*self.bodies(ax, scenery, frame), *self.marks(ax, scenery, frame)]
 
 
 def find_contact_marks(who: str, film: Trajectory, seen: Frames) -> ContactMarks:

@@ -9,10 +9,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.show import solids
+from physjax.show.bodies import bodies
 from physjax.show.frames import find_up_axis
 from physjax.show.over_time import over_time, phase
 from physjax.show.particles import particles
-from physjax.show.solids import bodies
 from physjax.show.spring_lines import springs
 from physjax.show.stage import AZIMUTH, ELEVATION
 from physjax.show.style import style

@@ -1,27 +1,14 @@
 """Rigid bodies as solids: triangles that are fixed to each body and turn with it."""
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, cast
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from physjax.checks import NestedArrayLike, as_real_quantity
-from physjax.meshes import check_mesh
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.planar import PlanarBodies, PlanarShape
-from physjax.physics.rigid.spatial import RigidBodies
-from physjax.show.frames import Frames, pick_frames, take_lanes
-from physjax.show.panels import build_scenery, draw_panels
-from physjax.show.planar import take_planar_bodies
-from physjax.show.planar_contacts import MarkedBodies, find_contact_marks
-from physjax.show.surfaces import draw_surface
-from physjax.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from matplotlib.typing import ColorType
+from physjax.physics.rigid.space import shapes as space
+from physjax.show.frames import Frames
 
 __all__ = ["Shape", "box", "capsule", "cylinder", "sphere"]
 
@@ -59,10 +46,6 @@ class Shape(NamedTuple):
         return Shape(np.concatenate(vertices), np.concatenate([f + s for f, s in zip(faces, starts, strict=True)]))
 
 
-BodyShapes = Shape | Sequence[Shape] | PlanarShape | Sequence[PlanarShape]
-"""A shape for all bodies or one for each, in space or in the plane."""
-
-
 def box(size: NestedArrayLike) -> Shape:
     """A box with edges along the axes [m], `(3,)`."""
     return Shape(_CUBE * np.asarray(as_real_quantity("size [m]", size, above=0.0), float), _CUBE_FACES)
@@ -87,96 +70,23 @@ def sphere(radius: float) -> Shape:
     return capsule(radius, 0.0)
 
 
-def bodies(
-    film: Trajectory,
-    shapes: BodyShapes | None = None,
-    frames: int | Iterable[int] | None = None,
-    *,
-    color: "ColorType | ArrayLike | None" = None,
-    contacts: bool = False,
-    figure: "Figure | None" = None,
-) -> "Figure":
-    """Draw rigid bodies at chosen frames, side by side, each as its shape; in space shaded by Lambert's law.
-
-    `shapes` is a `Shape` for all bodies or one for each: `solids.box`, `cylinder`, `capsule`, `sphere`, or
-    `Shape(*meshes.read_mesh(file)).at(-center)`; without it bodies are boxes of their inertia. In the plane it is a
-    `rigid.PlanarShape` or one for each, without it those of the scene's `rigid.Solids`; `color` may be a number for each,
-    and discs have a line that shows how they turn. With `contacts` there is a dot wherever they touch, and an arrow for
-    each steady force, of which the title says the scale. The other arguments are as in `plot.cloth`. Returns the
-    figure.
-
-    Example:
-        >>> from physjax.show import solids
-        >>> figure = plot.bodies(tumble, solids.box((1.0, 2.0, 3.0)), frames=[0, -1])
-        >>> len(figure.axes)
-        2
-    """
-    who = "plot.bodies"
-    seen, draw = prepare_bodies(who, film, shapes, color, contacts)
-    chosen = pick_frames(who, seen, frames)
-    return draw_panels(build_scenery(seen, chosen), chosen, draw, figure)
-
-
-def prepare_bodies(
-    who: str,
-    film: Trajectory,
-    shapes: BodyShapes | None,
-    color: "ColorType | ArrayLike | None",
-    contacts: bool = False,
-) -> tuple[Frames, Callable]:
-    """The frames of a run with the corners of all shapes in place of the bodies, and what draws them."""
-    if isinstance(film, Trajectory) and isinstance(film.state, PlanarBodies):
-        planar = cast("PlanarShape | Sequence[PlanarShape] | None", shapes)
-        seen, draw = take_planar_bodies(who, film, planar, color)
-        if not contacts:
-            return seen, draw
-        marks = find_contact_marks(who, film, seen)
-        return marks.annotate(seen), MarkedBodies(draw, marks)
-    if contacts:
-        raise ValueError(f"{who}: got contacts=True for a run in space, expected one of PlanarBodies. Leave it out.")
-    seen, faces = take_bodies(who, film, cast("Shape | Sequence[Shape] | None", shapes))
-    color = cast("ColorType", "#56B4E9" if color is None else color)
-    return seen, partial(draw_surface, faces=faces, color=color, closed=True)
-
-
-def take_bodies(who: str, film: Trajectory, shapes: Shape | Sequence[Shape] | None) -> tuple[Frames, np.ndarray]:
-    """The frames of a run with the vertices of all shapes in place of the bodies, and the triangles between them."""
-    return place_shapes(*check_shapes(who, film, shapes))
-
-
-def check_shapes(
-    who: str, film: Trajectory, shapes: Shape | Sequence[Shape] | None
-) -> tuple[Frames, np.ndarray, list[Shape]]:
-    """Centres of mass of a run's bodies, their quaternions `(frames, bodies, 4)`, and a checked shape for each."""
-    seen = take_lanes(who, film, dims=(3,))
-    if not isinstance(film.state, RigidBodies):
-        raise TypeError(
-            f"{who}: got a film of {type(film.state).__name__}, expected RigidBodies. plot.paths draws others."
-        )
-    lanes = seen.position.shape[1]
-    given = build_inertia_boxes(who, film) if shapes is None else shapes
-    found = [given] * lanes if isinstance(given, Shape) else list(given)
-    if len(found) != lanes or not all(isinstance(shape, Shape) for shape in found):
-        raise ValueError(f"{who}: got {len(found)} shapes, expected a Shape for all {lanes} bodies or one for each.")
-    checked = [Shape(*check_mesh(*shape, name=f"{who}: shape {i}")) for i, shape in enumerate(found)]
-    return seen, np.asarray(film.state.orientation, float).reshape(len(seen.time), lanes, 4), checked
+def triangulate_shape(shape: space.Shape) -> Shape:
+    """The surface of a shape that keeps bodies apart in a scene, a `rigid.Shape`."""
+    half, radius = np.asarray(shape.half, float), float(shape.radius)
+    if shape.kind == "box":
+        return box(2 * half)
+    axis = int(np.argmax(half))
+    return sphere(radius) if shape.kind == "sphere" else capsule(radius, 2 * half[axis], axis=axis)
 
 
 def place_shapes(seen: Frames, orientation: np.ndarray, shapes: list[Shape]) -> tuple[Frames, np.ndarray]:
     """The shapes of bodies moved and turned with them: frames of all their vertices, and the triangles between them."""
     corners = [
-        seen.position[:, i, None] + _rotate(orientation[:, i, None], shape.vertices[None])
+        seen.position[:, i, None] + rotate_vectors(orientation[:, i, None], shape.vertices[None])
         for i, shape in enumerate(shapes)
     ]
     whole = shapes[0].joined(*shapes[1:])
     return seen._replace(position=np.concatenate(corners, axis=1)), whole.faces
-
-
-def build_inertia_boxes(who: str, film: Trajectory) -> list[Shape]:
-    """The box of each body of a run; a ValueError for a run without its scene."""
-    if film.scene is None:
-        raise ValueError(f"{who}: got a run without its scene, expected a shape for each body. Load it with scene=.")
-    return [build_inertia_box(film.scene.mass, lane) for lane in np.ndindex(film.scene.state.lanes)]
 
 
 def build_inertia_box(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
@@ -198,7 +108,7 @@ def build_inertia_box(inertia: Inertia, lane: tuple[int, ...] = ()) -> Shape:
     return solid._replace(vertices=solid.vertices @ axes.T)
 
 
-def _rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+def rotate_vectors(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors turned by unit quaternions (w, x, y, z): v + 2w (u × v) + 2u × (u × v)."""
     twice = 2 * np.cross(q[..., 1:], v)
     return v + q[..., :1] * twice + np.cross(q[..., 1:], twice)

@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
-    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 STRAIN_PERCENTILE = 99.0
 """The colours reach to this percentile of the strains; arrows on the colour bar say that some go beyond."""
@@ -29,6 +27,8 @@ MAX_BLOWN_UP_STRAIN = 1.0
 """The largest strain that has a colour in a run that blew up: a spring of twice its length."""
 MIN_STRAIN_LIMIT = 0.01
 """The largest strain that has a colour where no spring is stretched at all."""
+BROKEN_LOOK: dict[str, Any] = {"colors": "0.75", "linewidths": 0.7, "linestyles": (0, (3, 3)), "zorder": 2}
+"""Of what is broken: thin, dashed and grey."""
 
 
 class SpringLines(NamedTuple):
@@ -116,12 +116,10 @@ def draw_springs(ax: "Axes", scenery: Scenery, frame: int, *, spring_lines: Spri
     held = inside if spring_lines.held is None else inside & spring_lines.held[frame]
     colours = spring_lines.colours().to_rgba(100 * spring_lines.strain(position)[held])
     width = float(np.clip(60 / np.sqrt(len(ends)), 0.5, 2.2))
-    drawn = [_build_collection(ends[held], colors=colours, linewidths=width, zorder=3)] if held.any() else []
+    drawn = [add_lines(ax, ends[held], colors=colours, linewidths=width, zorder=3)] if held.any() else []
     broken = inside & ~held
     if broken.any():
-        drawn.append(_build_collection(ends[broken], colors="0.75", linewidths=0.7, linestyles=(0, (3, 3)), zorder=2))
-    for collection in drawn:
-        (ax.add_collection if scenery.flat else cast("Axes3D", ax).add_collection3d)(collection)
+        drawn.append(add_lines(ax, ends[broken], **BROKEN_LOOK))
     return [*drawn, *scenery.draw_solids(ax, frame)]
 
 
@@ -132,12 +130,14 @@ def choose_strain_bar(spring_lines: SpringLines) -> "Callable[[Figure, dict[str,
     return lambda figure, where: draw_colour_bar(figure, where, spring_lines.colours(), "strain [%]", extend="both")
 
 
-def _build_collection(ends: np.ndarray, **style: Any) -> "LineCollection | Line3DCollection":
-    """Lines between ends `(springs, 2, dim)`."""
+def add_lines(ax: "Axes", ends: np.ndarray, **style: Any) -> "Artist":
+    """Add lines between ends `(lines, 2, dim)` to axes in the plane or in space."""
     if ends.shape[-1] == 2:
         from matplotlib.collections import LineCollection
 
-        return LineCollection(list(ends), **style)
+        return ax.add_collection(LineCollection(list(ends), **style))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    return Line3DCollection(ends, **style)
+    lines = Line3DCollection(ends, **style)
+    cast("Axes3D", ax).add_collection3d(lines)
+    return lines

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -54,18 +54,27 @@ def cloth(
 
 
 def draw_surface(
-    ax: "Axes3D", scenery: Scenery, frame: int, *, faces: np.ndarray, color: "ColorType", closed: bool = False
+    ax: "Axes3D",
+    scenery: Scenery,
+    frame: int,
+    *,
+    faces: np.ndarray,
+    color: "ColorType | np.ndarray",
+    closed: bool = False,
 ) -> "list[Artist]":
     """Draw a frame into axes in space: faces behind a solid obstacle, the obstacles, and the faces in front of them.
 
     Of a `closed` surface the far side comes first: sorted by depth with the near one, some of it would show through.
+    `color` is one for all faces or, `(faces, 3)`, one for each.
     """
     from matplotlib.colors import to_rgb
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
     position = scenery.position(frame)
-    faces = faces[scenery.stage.contains(position)[faces].all(axis=1)]
-    triangles, colours = position[faces], compute_brightness(position, faces, scenery.up)[:, None] * to_rgb(color)
+    inside = scenery.stage.contains(position)[faces].all(axis=1)
+    own = color[inside] if isinstance(color, np.ndarray) and color.ndim == 2 else to_rgb(cast("ColorType", color))
+    faces = faces[inside]
+    triangles, colours = position[faces], compute_brightness(position, faces, scenery.up)[:, None] * own
     solids = obstacles.find_solids(scenery.stage, scenery.contacts, scenery.run.time[frame])
     layers = np.where(obstacles.find_hidden(solids, triangles.mean(axis=1), ax, scenery.up), 2, 4)
     if closed:
@@ -84,12 +93,32 @@ def draw_surface(
 
 def find_back_faces(triangles: np.ndarray, ax: "Axes3D") -> np.ndarray:
     """Which triangles `(n, 3, 3)` are seen from behind: their corners go round clockwise as the axes show them."""
+    (xa, xb, xc), (ya, yb, yc), _ = _project(triangles, ax).transpose(2, 1, 0)
+    return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
+
+
+def find_covered_points(points: np.ndarray, triangles: np.ndarray, ax: "Axes3D") -> np.ndarray:
+    """Which points `(points, 3)` are behind one of the triangles `(n, 3, 3)` as the axes show them."""
+    # depth grows away from the eye, and is linear along a plane on paper as well
+    (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = _project(triangles, ax).transpose(2, 1, 0)
+    area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+    some = np.abs(area) > 0
+    xa, xb, xc, ya, yb, yc, za, zb, zc, area = (part[some] for part in (xa, xb, xc, ya, yb, yc, za, zb, zc, area))
+    covered = np.zeros(len(points), bool)
+    for i, (x, y, z) in enumerate(_project(points, ax)):
+        to_b = ((x - xa) * (yc - ya) - (xc - xa) * (y - ya)) / area
+        to_c = ((xb - xa) * (y - ya) - (x - xa) * (yb - ya)) / area
+        inside = (to_b >= 0) & (to_c >= 0) & (to_b + to_c <= 1)
+        covered[i] = (inside & (z > za + to_b * (zb - za) + to_c * (zc - za))).any()
+    return covered
+
+
+def _project(points: np.ndarray, ax: "Axes3D") -> np.ndarray:
+    """Points `(..., 3)` as the axes show them: across and up on paper, and the depth."""
     from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-    x, y, z = triangles.reshape(-1, 3).T
-    x, y, _ = proj_transform(x, y, z, ax.get_proj())
-    (xa, xb, xc), (ya, yb, yc) = (np.reshape(part, (-1, 3)).T for part in (x, y))
-    return (xb - xa) * (yc - ya) < (xc - xa) * (yb - ya)
+    x, y, z = points.reshape(-1, 3).T
+    return np.stack(proj_transform(x, y, z, ax.get_proj()), axis=-1).reshape(points.shape)
 
 
 def compute_brightness(position: np.ndarray, faces: np.ndarray, up: int = 1) -> np.ndarray:

@@ -76,9 +76,9 @@ def view(
 
     `shown` is what the film is drawn as: a cloth, a jelly or a mesh as a surface, springs or a lattice without faces as
     lines coloured by strain, a `solids` shape or one for each body, in the plane a `rigid.PlanarShape`. Without it bodies
-    are boxes of their inertia or the shapes of the scene's `rigid.Solids`, nodes are joined by the scene's springs or rods,
-    and everything else is dots with their paths. `color` is one for surfaces and bodies, a value for each lane for dots and
-    bodies in the plane. The page plays `speed` seconds of the run a second, in `fps`
+    are the shapes of the scene's `rigid.Solids` or boxes of their inertia, nodes are joined by the scene's springs or rods,
+    and everything else is dots with their paths; rods and ropes between bodies are lines. `color` is one for surfaces and
+    bodies, or a value for each lane for dots and bodies. The page plays `speed` seconds of the run a second, in `fps`
     frames. Positions are rounded to 1/65 534 of the sides of the box. A run that blew up is shown until its last good frame.
 
     Raises TypeError or ValueError for a film, `shown`, `color`, `fps` or `speed` that do not fit; runs in one dimension

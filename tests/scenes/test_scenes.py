@@ -27,7 +27,8 @@ SLOW = (
     "stiff_jelly",
 )
 PILES = ("box_on_slope", "stack_of_ten", "stack_of_sizes", "pyramid", "card_house")
-SOLIDS = (*PILES, "wrecking_ball", "newtons_cradle", "billiard_break", "dominoes", "marble_run", "see_saw")
+IN_SPACE = ("stack_in_space", "pyramid_in_space", "cradle_in_space", "marbles")
+SOLIDS = (*PILES, *IN_SPACE, "wrecking_ball", "newtons_cradle", "billiard_break", "dominoes", "marble_run", "see_saw")
 """What compiles for many seconds."""
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from physjax import Particles, Scene, animate, inertia, methods, plot, rigid, simulate
 from physjax.show import solids
-from physjax.show.solids import take_bodies
+from physjax.show.bodies import check_shapes
 from physjax.show.surfaces import find_back_faces
 
 BRICK = inertia.box(1.0, (1.0, 2.0, 3.0))
@@ -42,7 +42,7 @@ def test_shapes_lie_along_their_axis_and_are_joined():
 
 
 def test_every_body_is_drawn_where_it_is_and_as_it_stands():
-    seen, faces = take_bodies("plot.bodies", FILM, solids.box((1.0, 2.0, 3.0)))
+    seen, faces = solids.place_shapes(*check_shapes("plot.bodies", FILM, solids.box((1.0, 2.0, 3.0))))
     assert (seen.position.shape, faces.max()) == ((3, 16, 3), 15)
     np.testing.assert_allclose(np.ptp(seen.position[0, :8], axis=0), [1, 2, 3], rtol=1e-6)
     np.testing.assert_allclose(np.ptp(seen.position[0, 8:], axis=0), [2, 1, 3], rtol=1e-6)  # a quarter turn about z

@@ -9,7 +9,7 @@ import pytest
 from physjax import Particles, Scene, animate, contacts, forces, methods, simulate
 from physjax.show import export, obstacles, plot
 from physjax.show.auto_plot import plot_run
-from physjax.show.solids import _rotate
+from physjax.show.solids import rotate_vectors
 
 
 def thrown(up):
@@ -61,4 +61,4 @@ def test_gltf_is_y_up_whatever_the_scene_is(up, tmp_path):
         return
     x, y, z, w = root["rotation"]
     assert root["children"] == [0]
-    np.testing.assert_allclose(_rotate(np.array([w, x, y, z]), np.eye(3)[up]), [0.0, 1.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(rotate_vectors(np.array([w, x, y, z]), np.eye(3)[up]), [0.0, 1.0, 0.0], atol=1e-15)
