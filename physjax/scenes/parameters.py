@@ -46,7 +46,7 @@ BOUNDS: dict[str, tuple[str, float, float]] = {
     "particles": ("", 1, 100_000),
     "push": ("rad/s", 0.0, 10.0),
     "radius": ("m", 1e-4, 1e3),
-    "rate": ("1/s", 1.0, 1e6),
+    "rate": ("1/s", 1e-9, 1e6),
     "ratio": ("", 0.01, 1e5),
     "response_time": ("s", 0.05, 10.0),
     "restitution": ("", 0.0, 1.0),

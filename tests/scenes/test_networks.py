@@ -35,11 +35,11 @@ def test_a_stiff_rope_comes_to_rest_in_a_catenary():
 
 
 @pytest.mark.slow
-def test_a_cloth_sags_as_far_under_every_method():
+def test_a_cloth_sags_as_far_under_methods_of_every_order():
     scene = SCENES["hanging_cloth"]().scene  # near its limit of 1.8 ms, explicit Euler finds another fold
     ends = [
-        simulate(scene, method, dt=1e-3, steps=4500, save_every=4500).final_scene.state.position
-        for method in METHODS.values()
+        simulate(scene, METHODS[name], dt=1e-3, steps=4500, save_every=4500).final_scene.state.position
+        for name in ("euler", "semi_implicit_euler", "verlet", "rk4", "dopri8")
     ]
     assert np.ptp(np.stack(ends), axis=0).max() < 1e-6
     assert np.linalg.norm(ends[0] - scene.state.position, axis=-1).max() > 0.3

@@ -57,7 +57,8 @@ def test_bricks_rest_below_the_angle_of_friction_and_slide_above():
     run = simulate(start, methods.verlet, dt=1 / 60, steps=60)
     speed = np.asarray(run.state.momentum[-1, :, 0, 0]) / 2
     np.testing.assert_allclose(speed[:3], 0, atol=1e-12)
-    np.testing.assert_allclose(speed[3:], GRAVITY * (np.sin(angle) - 0.4 * np.cos(angle))[3:], rtol=1e-3)
+    # gravity changes speeds by 0.04 m/s in a sub-step, and the first one begins without any friction
+    np.testing.assert_allclose(speed[3:], GRAVITY * (np.sin(angle) - 0.4 * np.cos(angle))[3:], atol=1e-3)
 
 
 def test_the_last_ball_of_a_cradle_leaves_with_the_speed_of_the_first():
@@ -104,7 +105,7 @@ def test_impacts_keep_momentum_and_angular_momentum_and_gain_no_energy():
 
 
 def test_a_world_alone_in_a_batch_and_under_vmap_is_the_same():
-    batch = collide(6, contacts.Coulomb(0.4, 0.4), 0.3)
+    batch = collide(3, contacts.Coulomb(0.4, 0.4), 0.3)
     run = lambda scene: simulate(scene, methods.verlet, dt=1 / 60, steps=45, save_every=45).position[-1]  # noqa: E731
     pick = lambda tree, k: jax.tree.map(lambda leaf: leaf[k], tree)  # noqa: E731
     together = run(batch)
@@ -116,7 +117,8 @@ def test_a_world_alone_in_a_batch_and_under_vmap_is_the_same():
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_of_a_throw_with_a_bounce_are_those_of_differences(mode):
-    solids = rigid.Solids(rigid.Shape.box(SIZE), (contacts.Plane((0, 0, 0), (0, 1, 0), 0.5, coulomb=FLOOR.coulomb),))
+    ground = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.5, coulomb=FLOOR.coulomb)
+    solids = rigid.Solids(rigid.Shape.box(SIZE), (ground,))
     turn, spin = jnp.array([[0.9, 0.1, 0.2, 0.3]]), jnp.array([[0.3, 0.2, 1.0]])
 
     def throw(speed):

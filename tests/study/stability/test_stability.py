@@ -90,7 +90,7 @@ def test_the_limit_of_the_chain_of_fifty_is_the_measured_one(method):
 
 
 @pytest.mark.parametrize(
-    ("count", "damped"), [(8, True), *(pytest.param(200, damped, marks=pytest.mark.slow) for damped in (False, True))]
+    ("count", "damped"), [(8, True), *(pytest.param(60, damped, marks=pytest.mark.slow) for damped in (False, True))]
 )
 def test_the_limits_of_random_networks_are_the_measured_ones(count, damped):
     many = networks(count, damped, *((5, 2) if count == 8 else (8, 2)))
