@@ -257,7 +257,7 @@ class Contact(eqx.Module):
 
     def demand_fit(self, state: PyTree, mass: PyTree) -> None:
         """Raise a TypeError for a state of another kind, and a ValueError for lanes that start on the wrong side."""
-        hint = "rigid bodies need rigid.SurfaceContact(hull, plane), those in the plane rigid.Solids(shapes, (plane,))"
+        hint = "rigid bodies need rigid.Solids(shapes, (plane,)), or in space rigid.SurfaceContact(hull, plane)"
         demand_particles("contacts", state, hint)
         demand_start_outside(self, state)
 

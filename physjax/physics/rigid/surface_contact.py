@@ -4,7 +4,7 @@
     brick, hull = inertia.box(2.0, size), rigid.ContactPoints.box(size)
     Scene(rigid.bodies(brick, (0, 2, 0)), brick, (forces.Gravity(),), contacts=(rigid.SurfaceContact(hull, floor),))
 
-Bodies pass through each other: there are no stacks, and no mesh against mesh.
+Bodies pass through each other: `rigid.Solids` keeps them apart.
 """
 
 from collections.abc import Callable

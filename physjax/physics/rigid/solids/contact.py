@@ -33,9 +33,9 @@ class Solids(Contact):
     """Bodies that may not pass each other or the surfaces, in the plane or in space, with restitution K_r and Coulomb's friction.
 
     `shapes` is one for all bodies, or a sequence with one for each in the last lane axis: `rigid.PlanarShape` in the plane,
-    `rigid.Shape` in space. `surfaces` are those of `contacts`,
-    with a restitution and friction of their own. Between bodies it is the mean of the two where `restitution` is given for
-    each. `pairs`, `(pairs, 2)`, lists those that can touch: without, all pairs, of up to 64 bodies.
+    `rigid.Shape` in space. `surfaces` are those of `contacts`, with a restitution and friction of their own. Between bodies
+    it is the mean of the two where `restitution` is given for each. `pairs`, `(pairs, 2)`, lists those that can touch:
+    without, all pairs, of up to 64 bodies.
 
     Each step is taken in `substeps`. In each, what would reach another body bounces first, all hits that arrive together
     at once and until none approaches; then impulses keep every gap open and every contact from approaching, with those of
@@ -47,6 +47,10 @@ class Solids(Contact):
     5 and 3 mm; a stack of ten boxes of 1 m sinks by 1.1 and 0.3 mm, and sways by 2 and 0.5 mm before it is still. In 20 000
     drops of two to six bodies the energy was never above that at the start; what is fast and meets corner to corner may
     overlap by a part of its way in a sub-step, in one of a hundred worlds of six bodies by 2 % of the smallest.
+
+    In space a contact has four points, and friction acts at the middle of their pressure and against spin, within an ellipsoid
+    of both: exact for what only slides or only spins. With K_r = 1 and friction an oblique hit may gain a few per cent of
+    energy. A box touches curved surfaces with the corners of a face and the point next to them.
 
     Example:
         >>> crate, floor = inertia.planar_plate(2.0, (1.0, 1.0)), contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0)
