@@ -213,8 +213,8 @@ class Lift(Force):
     table: jax.Array
 
     def __call__(self, t, state, mass):
-        y = state.position[..., 1]
-        lift = jnp.interp(y, jnp.linspace(0.0, 4.0, self.table.shape[0]), self.table)
+        y, table = state.position[..., 1], self.table.reshape(-1)
+        lift = jnp.interp(y, jnp.linspace(0.0, 4.0, table.shape[0]), table)
         return jnp.stack([jnp.zeros_like(y), lift], axis=-1)
 
 

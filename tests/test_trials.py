@@ -93,5 +93,5 @@ def test_springs_to_nodes_that_are_not_there_are_refused_when_the_scene_is_built
 def test_a_class_in_place_of_a_part_and_a_table_in_place_of_a_method_are_named(unannotated):
     with pytest.raises(TypeError, match=r"got the class Gravity, .* Call it\."):
         Scene(BALL, forces=(forces.Gravity,))
-    with pytest.raises(TypeError, match="got a dict as the method"):
+    with pytest.raises(TypeError, match="got the method of type dict"):
         simulate(Scene(BALL), {"order": 4}, dt=0.1, steps=1)

@@ -66,9 +66,9 @@ def simulate(
     if not isinstance(scene, Scene):
         raise TypeError(f"simulate: got a {type(scene).__name__}, expected a Scene.")
     if not callable(method):
+        shown = repr(method) if isinstance(method, str) else f"of type {type(method).__name__}"
         raise TypeError(
-            f"simulate: got a {type(method).__name__} as the method, expected a function (system, t, state, dt) -> state, "
-            "e.g. methods.rk4."
+            f"simulate: got the method {shown}, expected a function (system, t, state, dt) -> state, e.g. methods.rk4."
         )
     if record is not None and not callable(record):
         raise TypeError(f"record: got {record!r}, expected a function (t, state) -> what to keep.")
