@@ -82,7 +82,7 @@ def test_aim_prints_both_arcs_and_draws_them(tmp_path, capsys):
     assert "out of reach" not in printed
     assert (tmp_path / "aim.png").stat().st_size > 10_000
     assert main([*aim, "--wind", "-5", "0", "--target", "400", "0"]) == 0
-    assert "nearest misses" in capsys.readouterr().out
+    assert "needs at least 62.61 m/s" in capsys.readouterr().out
 
 
 def test_aim_takes_the_axis_that_is_up(tmp_path, capsys):
