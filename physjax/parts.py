@@ -72,9 +72,9 @@ def is_untransformed(run: PyTree) -> bool:
 
 def _is_library_definition(definition: Any) -> bool:
     """Whether a function or class is the library's own, which closes over nothing."""
-    # what comes of an interactive session may have no module
-    ours = (getattr(definition, "__module__", None) or "").startswith("physjax.")
-    return ours and "<locals>" not in definition.__qualname__
+    return (
+        f"{getattr(definition, '__module__', '')}".startswith("physjax.") and "<locals>" not in definition.__qualname__
+    )
 
 
 class Force(eqx.Module):
