@@ -70,11 +70,9 @@ def is_untransformed(run: PyTree) -> bool:
     return get_opaque_trace_state() == _EAGER and not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(run))
 
 
-def _is_library_definition(definition: Any) -> bool:
+def _is_library_definition(thing: Any) -> bool:
     """Whether a function or class is the library's own, which closes over nothing."""
-    return (
-        f"{getattr(definition, '__module__', '')}".startswith("physjax.") and "<locals>" not in definition.__qualname__
-    )
+    return str(getattr(thing, "__module__", "")).startswith("physjax.") and "<locals>" not in thing.__qualname__
 
 
 class Force(eqx.Module):
