@@ -104,15 +104,12 @@ def test_impacts_keep_momentum_and_angular_momentum_and_gain_no_energy():
     assert (energy <= energy[0] * (1 + 1e-6)).all()
 
 
-def test_a_world_alone_in_a_batch_and_under_vmap_is_the_same():
+def test_a_world_in_a_batch_and_under_vmap_is_the_same():
     batch = collide(3, contacts.Coulomb(0.4, 0.4), 0.3)
     run = lambda scene: simulate(scene, methods.verlet, dt=1 / 60, steps=45, save_every=45).position[-1]  # noqa: E731
-    pick = lambda tree, k: jax.tree.map(lambda leaf: leaf[k], tree)  # noqa: E731
     together = run(batch)
     mapped = jax.vmap(lambda state, mass: run(collide_alone(state, mass)))(batch.state, batch.mass)
     np.testing.assert_allclose(mapped, together, atol=1e-9)
-    alone = run(collide_alone(pick(batch.state, 2), pick(batch.mass, 2)))
-    np.testing.assert_allclose(alone, together[2], atol=1e-9)
 
 
 def test_derivatives_of_a_throw_with_a_bounce_are_those_of_differences():
@@ -130,7 +127,7 @@ def test_derivatives_of_a_throw_with_a_bounce_are_those_of_differences():
 
     speed, small, run = jnp.array(0.7), 1e-5, jax.jit(throw)
     differences = (run(speed + small) - run(speed - small)) / (2 * small)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(throw))(speed), differences, atol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(throw))(speed), differences, atol=1e-8)
 
 
 def test_what_does_not_fit_is_refused_in_plain_words():
