@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from functools import reduce
 
 import jax.numpy as jnp
-from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -141,8 +140,8 @@ class SpatialMechanics(Mechanics):
 
 
 def _by_body(array: Array) -> Array:
-    """An array of vectors `(*worlds, bodies, dim)` as `(dim, bodies, worlds)`, in memory too: XLA would only see it so."""
-    return lax.map(jnp.transpose, jnp.moveaxis(array.reshape(-1, *array.shape[-2:]), -1, 0))
+    """An array of vectors `(*worlds, bodies, dim)` as `(dim, bodies, worlds)`."""
+    return jnp.transpose(array.reshape(-1, *array.shape[-2:]), (2, 1, 0))
 
 
 def _find_rotation(angle: Sequence[Array]) -> list[Array]:

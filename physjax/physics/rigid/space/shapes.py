@@ -51,18 +51,17 @@ class Shape(eqx.Module):
 
 
 class ShapeTable(NamedTuple):
-    """The shapes of all bodies: half edges `(3, bodies)`, radii `(bodies,)`, and which of them are boxes."""
+    """The shapes of all bodies: half edges `(3, bodies)` and radii `(bodies,)` [m]."""
 
     half: Array
     radius: Array
-    is_box: np.ndarray
 
 
 def tabulate_shapes(shapes: Sequence[Shape], dtype: np.dtype) -> ShapeTable:
     """The table of these shapes, one for each body."""
     half = jnp.stack([shape.half.astype(dtype) for shape in shapes], axis=-1)
     radius = jnp.stack([jnp.asarray(shape.radius, dtype) for shape in shapes])
-    return ShapeTable(half, radius, np.array([shape.kind == "box" for shape in shapes]))
+    return ShapeTable(half, radius)
 
 
 __all__ = ["Shape", "ShapeTable", "tabulate_shapes"]
