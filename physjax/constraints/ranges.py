@@ -105,8 +105,13 @@ def are_held(steps: Steps) -> Array:
     return steps % 2 == 0
 
 
-def change_steps(before: Steps, found: Steps, turn: Array) -> Steps:
-    """The steps that were found, or after `FREE_TURNS` the first of each world that differs from what it was before."""
+def change_steps(before: Steps, found: Steps, cap: Rows, turn: Array) -> Steps:
+    """The steps that were found, or after `FREE_TURNS` the first of each world that differs from what it was before.
+
+    A driven row goes one step of its staircase at a time: an impulse beyond its cap says that the drive gives way, and only
+    where that leads says whether a limit is met.
+    """
+    found = jnp.where(cap > 0, before + jnp.clip(found - before, -1, 1), found)
     differ = (before != found).reshape(-1, found.shape[-1])
     first = (differ & (jnp.cumsum(differ, axis=0) == 1)).reshape(found.shape)
     return jnp.where((turn < FREE_TURNS) | first, found, before)

@@ -98,9 +98,17 @@ def _take_step(motion: Callable, scene: Scene, t: Time, dt: Array) -> Scene:
     step = ClosingStep(take, partial(_correct, start, drift), partial(_invert, start), start.tolerance)
     none = jnp.zeros((mechanism.rows, len(mechanism.pairs), len(start.h)), start.h.dtype)
     _, gap, (end, _) = close_joints(step, none)
-    good = jnp.all(jnp.max(jnp.abs(gap), axis=(0, 1)) <= start.tolerance * float(jnp.finfo(gap.dtype).eps) ** -0.25)
-    end = jax.tree.map(lambda leaf: leaf * jnp.where(good, 1.0, jnp.nan).astype(leaf.dtype), end)
+    good = jnp.max(jnp.abs(gap), axis=(0, 1)) <= start.tolerance * float(jnp.finfo(gap.dtype).eps) ** -0.25
+    end = _keep_worlds(end, good)
     return scene.replace(state=stop_opening(mechanism, scene, end, TOUCHING * start.tolerance, start.h))
+
+
+def _keep_worlds(state: PyTree, good: Array) -> PyTree:
+    """The state with NaN in the worlds whose joints could not be closed."""
+    worlds, factor = state.lanes[:-1], jnp.where(good, 1.0, jnp.nan)
+    return jax.tree.map(
+        lambda leaf: leaf * factor.reshape(*worlds, *[1] * (leaf.ndim - len(worlds))).astype(leaf.dtype), state
+    )
 
 
 def _begin(scene: Scene, dt: Array) -> _Start:
@@ -137,7 +145,7 @@ def _correct(start: _Start, drift: Callable[[Rows], Places], λ: Rows, taken: tu
     def turn(carry: tuple) -> tuple:
         λ, places, x, steps, count = carry
         if allowed is not None:
-            steps = change_steps(steps, allowed.find_steps(x, λ), count)
+            steps = change_steps(steps, allowed.find_steps(x, λ), allowed.cap, count)
         # worlds whose joints are closed keep their impulses
         λ = jnp.where((worst(x, λ) > start.tolerance)[None, None], _take_newton_step(start, λ, places, steps), λ)
         places = mechanism.coordinates.carry_on(there, before, drift(λ))

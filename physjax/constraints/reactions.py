@@ -200,7 +200,7 @@ def _solve_bounded(
         def turn(carry: tuple) -> tuple:
             found, _, _, count = carry
             λ = solve(found)
-            return change_steps(found, allowed.find_steps(respond(λ), λ), count), found, λ, count + 1
+            return change_steps(found, allowed.find_steps(respond(λ), λ), allowed.cap, count), found, λ, count + 1
 
         none = jnp.zeros_like(right)
         steps = allowed.find_steps(right, none)

@@ -120,6 +120,25 @@ def test_limits_in_space_hold_in_float32():
     np.testing.assert_allclose(np.arccos(along).max(), 0.8, atol=1e-5)
 
 
+def test_a_servo_gives_way_to_a_rope_that_jerks_it_and_only_the_world_that_is_too_fast_fails():
+    bodies = rigid.PlanarInertia(jnp.broadcast_to(jnp.array([80.0, 150.0]), (2, 2)), jnp.full((2, 2), 27.0))
+    start = rigid.planar_bodies(bodies, [[[1.0, 0.0], [2.0, -1.65]]] * 2)
+    # the load of the second world would be a kilometre away after a step, on a rope of 1.5 m
+    start = start._replace(momentum=start.momentum.at[1, 1, 0].set(150 * 3e5))
+    shoulder = rigid.Hinges(
+        [(-1, 0)], [[[0.0, 0.0], [-1.0, 0.0]]], limits=(-0.2, 1.5), servo=1.2, response_time=0.3, torque=1e3
+    )
+    rope = rigid.Ropes([(0, 1)], [[[1.0, 0.0], [0.0, 0.25]]], 1.5)
+    film = simulate(Scene(start, bodies, (forces.Gravity(G), shoulder, rope)), methods.verlet, dt=0.004, steps=40)
+    angle, x = np.asarray(film.state.angle), np.asarray(film.position)
+    assert np.isfinite(x[:, 0]).all()
+    assert not np.isfinite(x[1:, 1]).any()
+    tip = x[:, 0, 0] + np.stack([np.cos(angle[:, 0, 0]), np.sin(angle[:, 0, 0])], axis=-1)
+    top = x[:, 0, 1] + 0.25 * np.stack([-np.sin(angle[:, 0, 1]), np.cos(angle[:, 0, 1])], axis=-1)
+    assert np.linalg.norm(tip - top, axis=-1).max() < 1.5 + 1e-9
+    assert angle[-1, 0, 0] < 0.0  # what the servo asks for is 0.5
+
+
 @pytest.mark.usefixtures("unannotated")
 @pytest.mark.parametrize(
     ("options", "message"),
