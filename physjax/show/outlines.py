@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -122,7 +123,7 @@ def _find_no_corners(contact: Contact, stage: Stage, t: float) -> list[np.ndarra
 
 def _find_foot(plane: Plane, stage: Stage, t: float) -> list[np.ndarray]:
     """The point of a plane below the corner of the box that is nearest to it, if the box is near."""
-    normal, corners = _unit(plane.normal), np.array(list(product(*zip(*stage, strict=True))))
+    normal, corners = _find_normal(plane, t), np.array(list(product(*zip(*stage, strict=True))))
     distance = (corners - _move(plane.point, plane, t)) @ normal
     nearest = np.abs(distance).argmin()
     near = distance.min() > 0 and distance[nearest] <= NEAR_FLOOR_SHARE * stage.size
@@ -130,28 +131,29 @@ def _find_foot(plane: Plane, stage: Stage, t: float) -> list[np.ndarray]:
 
 
 def _cut_plane(plane: Plane, stage: Stage, t: float) -> Outline:
-    return _build_sheets([_cut_box(stage, _move(plane.point, plane, t), _unit(plane.normal))], plane)
+    return _build_sheets([_cut_box(stage, _move(plane.point, plane, t), _find_normal(plane, t))], plane)
 
 
 def _cut_slab(slab: Slab, stage: Stage, t: float) -> Outline:
-    normal, half = _unit(slab.normal), float(slab.thickness) / 2
+    normal, half = _find_normal(slab, t), float(slab.thickness) / 2
     middle = _move(slab.point, slab, t)
     return _build_sheets([_cut_box(stage, middle + side * half * normal, normal) for side in (-1, 1)], slab)
 
 
 def _find_room_ends(room: Room, stage: Stage, t: float) -> list[np.ndarray]:
-    return [_move(corner, room, t) for corner in (room.lower, room.upper)]
+    corners = product(*np.stack([room.lower, room.upper], axis=-1))
+    return [_move(np.array(corner), room, t) for corner in corners]
 
 
 def _build_walls(room: Room, stage: Stage, t: float) -> Outline:
     """The six faces of a room."""
-    ends = np.stack(_find_room_ends(room, stage, t))
+    ends = np.stack([room.lower, room.upper])
     faces = []
     for axis, side in product(range(3), (0, 1)):
         a, b = (i for i in range(3) if i != axis)
         face = np.tile(ends[side], (4, 1))
         face[:, a], face[:, b] = ends[[0, 1, 1, 0], a], ends[[0, 0, 1, 1], b]
-        faces.append(face)
+        faces.append(_move(face, room, t))
     return _build_sheets(faces, room)
 
 
@@ -199,12 +201,23 @@ def _cut_box(stage: Stage, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def _move(place: ArrayLike, contact: Plane | Slab | Room | Sphere, t: float) -> np.ndarray:
-    """Where a place of a surface is at a time [m]."""
-    return np.asarray(place, float) + t * _get_velocity(contact)
+    """Where places of a surface are at a time [m]."""
+    place = np.asarray(place, float)
+    if contact.motion is not None:
+        return np.asarray(contact.motion.place(t, jnp.asarray(place)), float)
+    return place if contact.velocity is None else place + t * np.asarray(contact.velocity, float)
 
 
-def _get_velocity(contact: Plane | Slab | Room | Sphere) -> np.ndarray:
-    """How fast it moves [m/s]; zero, which fits places in the plane and in space, where it stands still."""
+def _find_normal(contact: Plane | Slab, t: float) -> np.ndarray:
+    """The normal of a flat surface at a time."""
+    normal = _unit(contact.normal)
+    return normal if contact.motion is None else np.asarray(contact.motion.turn(t, jnp.asarray(normal)), float)
+
+
+def _get_velocity(contact: Plane | Slab | Room | Sphere) -> np.ndarray | None:
+    """How fast it moves [m/s], zero where it stands still; None where it has a motion, so that it does not move on as it is."""
+    if contact.motion is not None:
+        return None
     return np.zeros(()) if contact.velocity is None else np.asarray(contact.velocity, float)
 
 

@@ -69,7 +69,8 @@ def decide_contact_mode(
     load_speed_squared = load_squared * (dt * dt)
     touching = jnp.isfinite(since) & _is_close(touch, state, load_speed_squared, dt)
     contacts = _build_contact_states(surfaces, touch, time, state, touching, load_speed_squared)
-    left, normal_force = _solve_contact_forces(contacts, _subtract_carried(surfaces, contacts, load, time, state))
+    contacts, surplus = _enter_surface_frame(surfaces, contacts, load, time, state)
+    left, normal_force = _solve_contact_forces(contacts, surplus)
     away = dot(jnp.broadcast_to(left, touch.normal.shape), touch.normal) + contacts.curvature_acceleration
     pressed = touching & ~((normal_force <= 0) & (away > 0))
     # sticking takes both: no slip yet, on any surface, and a load that static friction balances
@@ -168,7 +169,7 @@ def _build_contact_states(
     rounding = STILL_ROUNDING * float(jnp.finfo(state.dtype).eps)
     speed_squared = dot(state.velocity, state.velocity) + load_speed_squared
     still = dot(across, across) <= (rounding**2 * speed_squared)[None]
-    turn = surfaces.curvature_acceleration(t, state)
+    turn = surfaces.distance_acceleration(t, state)
     return _ContactStates(
         number,
         touch.normal,
@@ -179,16 +180,20 @@ def _build_contact_states(
     )
 
 
-def _subtract_carried(
+def _enter_surface_frame(
     surfaces: Surfaces, contacts: _ContactStates, load: Array, t: ArrayLike, state: Particles
-) -> Array:
-    """The load less what a lane needs along the surface to turn with it; across it, the curvature asks for that already."""
+) -> tuple[_ContactStates, Array]:
+    """The contacts and the load in the frame of what accelerates: there a lane that sticks needs no acceleration at all.
+
+    What the frame takes from the load it gives back to the second derivatives of the distances.
+    """
     carried = surfaces.acceleration_at(t, state.position)
     if carried is None:
-        return load
-    along = carried - scale(dot(carried, contacts.normal), contacts.normal)
-    turns = mask_surfaces(surfaces.turns, contacts.touching).astype(load.dtype)
-    return load - average_surfaces(contacts.touching * turns, along)
+        return contacts, load
+    leads = mask_surfaces(surfaces.accelerates, contacts.touching).astype(load.dtype)
+    frame = average_surfaces(contacts.touching * leads, carried)
+    turn = contacts.curvature_acceleration + dot(jnp.broadcast_to(frame, contacts.normal.shape), contacts.normal)
+    return contacts._replace(curvature_acceleration=turn), load - frame
 
 
 def _find_sticking_limit(surfaces: Surfaces, lanes: tuple[int, ...]) -> Array | None:

@@ -85,8 +85,8 @@ def _find_stop(before: Array, after: Array) -> Dip:
 def find_dip(face: Face, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Dip:
     """The first dip of the signed distance by the cubic d(s) = d₀ + r s + b s² + a s³ through the ends of the leg."""
     d0, d1 = face.signed_distance(t, start.position), face.signed_distance(t + dt, end.position)
-    r0 = dt * dot(face.relative(start.velocity), face.normal_at(t, start.position))
-    r1 = dt * dot(face.relative(end.velocity), face.normal_at(t + dt, end.position))
+    r0 = dt * dot(face.relative(t, *start), face.normal_at(t, start.position))
+    r1 = dt * dot(face.relative(t + dt, *end), face.normal_at(t + dt, end.position))
     cubic = Cubic.through(d0, d1, r0, r1)  # pyright: ignore[reportArgumentType]  # a number times an array is an array
     # infinite or NaN where the cubic has no minimum, and then not taken
     lowest, highest = cubic.extrema()

@@ -29,7 +29,7 @@ class Face(Protocol):
         """Unit vector towards the legal side."""
         ...
 
-    def relative(self, velocity: Array) -> Array:
+    def relative(self, t: ArrayLike, position: Array, velocity: Array) -> Array:
         """Velocities relative to the surface [m/s]."""
         ...
 
@@ -47,9 +47,18 @@ class ContactFace(Face, Material, Protocol):
     """A surface that particles can rest on: its geometry with its curvature, restitution and friction."""
 
     curved: bool
-    velocity: OptionalNumbers
-    angular_velocity: OptionalNumbers
+    motion: Any
     touching_since: OptionalNumbers
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves, or turns within itself."""
+        ...
+
+    @property
+    def accelerates(self) -> bool:
+        """Whether what sticks to it is accelerated."""
+        ...
 
     def facing(self, t: ArrayLike, position: Array) -> "ContactFace":
         """The surface as a lane at this position meets it."""
@@ -60,11 +69,11 @@ class ContactFace(Face, Material, Protocol):
         ...
 
     def acceleration_at(self, t: ArrayLike, position: Array) -> Array | None:
-        """The acceleration of what sticks to the surface there [m/s²]; None where it does not turn."""
+        """The acceleration of what sticks to the surface there [m/s²]; None where it has none."""
         ...
 
-    def curvature_acceleration(self, t: ArrayLike, position: Array, relative: Array) -> Array:
-        """What the curvature adds to the second time derivative of the signed distance [m/s²]."""
+    def distance_acceleration(self, t: ArrayLike, state: Particles) -> Array:
+        """The second time derivative of the signed distance of lanes that are not accelerated [m/s²]."""
         ...
 
     def may_meet(

@@ -95,7 +95,7 @@ def meet_surface(
         select_surface(chosen, touch.distance),
         select_surface(chosen, touch.normal),
         at.velocity if carried is None else at.velocity - carried,
-        pick(faces.curvature_acceleration(t, at)),
+        pick(faces.distance_acceleration(t, at)),
         select_surface(chosen, faces.restitution(lanes)),
         pick(faces.friction(lanes)),
         None if static is None or kinetic is None else _Dry(static, kinetic),
@@ -126,8 +126,11 @@ def judge_event(
     if meeting.slip is not None:
         # one that only turned, on a curved surface, also crosses zero along its first direction
         then = meeting.slip + (before.velocity - at.velocity)
-        slowed = dot(meeting.slip, meeting.slip) < STOPPED_SPEED_SQUARED_SHARE * dot(then, then)
-        stops = reached & ~on_surface & slowed
+        slip_squared, eps = dot(meeting.slip, meeting.slip), float(jnp.finfo(at.dtype).eps)
+        slowed = slip_squared < STOPPED_SPEED_SQUARED_SHARE * dot(then, then)
+        # on a surface that moves, what is left of a slide may be the rounding of both velocities
+        rounding = slip_squared <= (LEAVING_ROUNDING * eps) ** 2 * dot(at.velocity, at.velocity)
+        stops = reached & ~on_surface & (slowed | rounding)
     return Verdict(guard, bounces, rests, stops)
 
 

@@ -34,7 +34,7 @@ def find_path_dip(
     p = start.position
     path = Cubic.through(p, end.position, scale(dt, start.velocity), scale(dt, end.velocity))
     signed_distance = lambda s: face.signed_distance(t + s * dt, path.at(s))  # noqa: E731
-    far = jnp.maximum(bound_path_length(face, dt, start, end), float(jnp.finfo(p.dtype).tiny))
+    far = jnp.maximum(bound_path_length(face, t, dt, start, end), float(jnp.finfo(p.dtype).tiny))
     touch = TOUCH_ROUNDING * float(jnp.finfo(p.dtype).eps) * (norm(p) + far)
     met = _advance_to_surface(signed_distance, far, touch)
     s, d = _descend_to_lowest_point(signed_distance, met, touch)
@@ -93,8 +93,10 @@ def _descend_to_lowest_point(
     return s, d
 
 
-def bound_path_length(face: Face, dt: ArrayLike, start: Particles, end: Particles) -> Float[Array, "*lanes"]:
+def bound_path_length(
+    face: Face, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles
+) -> Float[Array, "*lanes"]:
     """Upper bound of the length of the cubic path through the ends of a leg, relative to the surface [m]."""
-    u, w = (scale(dt, face.relative(state.velocity)) for state in (start, end))
+    u, w = (scale(dt, face.relative(at, *state)) for at, state in ((t, start), (t + dt, end)))
     chord = end.position - start.position + (u - scale(dt, start.velocity))
     return jnp.maximum(jnp.maximum(norm(u), norm(w)), norm(3.0 * chord - u - w))

@@ -47,7 +47,7 @@ class Reaction(eqx.Module):
 
     def _add_reactions(self, t: ArrayLike, state: Particles, acceleration: Array) -> Array:
         normal = self._take_places(self.surfaces.normal_at(t, state.position))
-        turn = self.surfaces.curvature_acceleration(t, state)
+        turn = self.surfaces.distance_acceleration(t, state)
         along = normal if self.slip is None else self._lean(t, normal, state, self.slip)
         # N_j along each reaction so that no lane accelerates into a surface that it presses on: n·a + v·∇n·v = 0
         wanted = -dot(jnp.broadcast_to(acceleration, normal.shape), normal)
@@ -57,14 +57,16 @@ class Reaction(eqx.Module):
         acceleration = acceleration + (
             scale(force[0], along[0]) if len(force) == 1 else jnp.sum(scale(force, along), 0)
         )
-        # a product and not a choice: `where` between vectors costs several times the step
-        acceleration = scale(1 - self.still, acceleration)
         carried = self.surfaces.acceleration_at(t, state.position)
+        # a product and not a choice: `where` between vectors costs several times the step
         if carried is None:
-            return acceleration
-        turns = jnp.broadcast_to(mask_surfaces(self.surfaces.turns, carried[..., 0]), carried.shape[:-1])
-        pressed = self.pressed * self._take_places(turns.astype(acceleration.dtype))
-        return acceleration + scale(self.still, average_surfaces(pressed, self._take_places(carried)))
+            return scale(1 - self.still, acceleration)
+        leads = jnp.broadcast_to(mask_surfaces(self.surfaces.accelerates, carried[..., 0]), carried.shape[:-1])
+        pressed = self.pressed * self._take_places(leads.astype(acceleration.dtype))
+        # what sticks is let go within a step where its surface falls away from it
+        pulled = jnp.all(force <= 0, axis=0) & jnp.any(pressed * wanted < 0, axis=0)
+        still = jnp.where(pulled, 0.0, self.still)
+        return scale(1 - still, acceleration) + scale(still, average_surfaces(pressed, self._take_places(carried)))
 
     def _take_places(self, values: Array) -> Array:
         """Of each place the value of the surface that takes it: a sum, of which all shares but one are zero."""

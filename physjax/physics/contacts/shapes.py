@@ -2,7 +2,8 @@
 
 `signed_distance` [m] is positive on the legal side, zero on the surface and negative on the wrong side; `normal_at`
 points to the legal side. Shapes may move with a constant `velocity` [m/s] from where they are at t = 0 (a piston, a
-bat), and turn within themselves with an `angular_velocity` [rad/s] (a turntable, a drum). The contact response is the
+bat), turn within themselves with an `angular_velocity` [rad/s] (a turntable, a drum), or have a `motion` that is any
+function of time (a shaken table, a lift, a paddle that swings). The contact response is the
 same for all of them and stands in `surface`.
 """
 
@@ -71,7 +72,7 @@ class Plane(Surface):
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """N, of length 1."""
-        return broadcast_vector(_unit_normal(self), position)
+        return _turn_normal(self, t, position)
 
     def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
         """The plane with its normal scaled to length 1, once for all that is asked of it."""
@@ -114,14 +115,13 @@ class Slab(Surface):
 
     def normal_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
         """The normal of the nearer face."""
-        side = jnp.where((self._height_above_middle(t, position) < 0) != self.inside, -1.0, 1.0)
-        return scale(side, broadcast_vector(_unit_normal(self), position))
+        return scale(self._find_side(t, position), _turn_normal(self, t, position))
 
     def facing(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Surface:
         """The face on the lane's side, as a plane: a fast lane cannot mistake it for the other face."""
         if self.inside:
             return _scale_normal(self)  # a lane that passes either face has left the corridor
-        normal = self.normal_at(t, position)
+        normal = scale(self._find_side(t, position), broadcast_vector(_unit_normal(self), position))
         return Plane(
             point=broadcast_vector(self.point, position) + scale(self.thickness / 2, normal),
             normal=normal,
@@ -130,6 +130,7 @@ class Slab(Surface):
             coulomb=self.coulomb,
             velocity=self.velocity,
             angular_velocity=self.angular_velocity,
+            motion=self.motion,
             scaled=True,
         )
 
@@ -140,11 +141,21 @@ class Slab(Surface):
         return () if self.inside else (jnp.where(crosses, h0 / jnp.where(crosses, h0 - h1, 1.0), 0.0),)
 
     def _height_above_middle(self, t: ArrayLike, position: Array) -> Array:
-        return _measure_height(self, t, position, broadcast_vector(_unit_normal(self), position))
+        return _measure_height(self, t, position, _turn_normal(self, t, position))
+
+    def _find_side(self, t: ArrayLike, position: Array) -> Array:
+        """Along the normal of the slab (1) or against it (-1) points that of the nearer face."""
+        return jnp.where((self._height_above_middle(t, position) < 0) != self.inside, -1.0, 1.0)
 
 
 def _unit_normal(surface: Plane | Slab) -> Array:
     return surface.normal if surface.scaled else unit(surface.normal)
+
+
+def _turn_normal(surface: Plane | Slab, t: ArrayLike, like: Array) -> Array:
+    """The normal at a time, where the surface may have turned."""
+    normal = broadcast_vector(_unit_normal(surface), like)
+    return normal if surface.motion is None else surface.motion.turn(t, normal)
 
 
 def _scale_normal(surface: F) -> F:
@@ -186,7 +197,10 @@ def _measure_height(surface: Plane | Slab, t: ArrayLike, position: Array, normal
 
     Only the velocity along the normal moves a plane: a conveyor belt, which moves along itself, stays where it is.
     """
-    height = dot(position - broadcast_vector(surface.point, position), normal)
+    point = broadcast_vector(surface.point, position)
+    if surface.motion is not None:
+        return dot(position - surface.motion.place(t, point), normal)
+    height = dot(position - point, normal)
     if surface.velocity is None:
         return height
     velocity, normal = jnp.broadcast_arrays(surface.velocity, _unit_normal(surface))
@@ -246,9 +260,7 @@ class Sphere(Surface):
         p, chord = self._offset(t, start.position), self._offset(t + dt, end.position)
         chord = chord - p
         # a Hermite cubic is off its chord by at most a quarter of what its end velocities are off the chord's
-        sag = norm(scale(dt, self.relative(start.velocity)) - chord) + norm(
-            scale(dt, self.relative(end.velocity)) - chord
-        )
+        sag = norm(scale(dt, self.relative(t, *start)) - chord) + norm(scale(dt, self.relative(t + dt, *end)) - chord)
         s = jnp.clip(-dot(p, chord) / jnp.maximum(dot(chord, chord), SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
         nearest = p + scale(s, chord)
         # a lane that leaves the surface is nearest at its start, which is no dip
@@ -259,7 +271,7 @@ class Sphere(Surface):
         if self.inside:
             return dip
         p, q = self._offset(t, start.position), self._offset(t + dt, end.position)
-        u, w = scale(dt, self.relative(start.velocity)), scale(dt, self.relative(end.velocity))
+        u, w = scale(dt, self.relative(t, *start)), scale(dt, self.relative(t + dt, *end))
         path, chord = Cubic.through(p, q, u, w), q - p
         length = dot(chord, chord)
         s = jnp.clip(-dot(p, chord) / jnp.maximum(length, SMALLEST_LENGTH_SQUARED), 0.0, 1.0)
@@ -273,9 +285,20 @@ class Sphere(Surface):
         p, along = self._offset(t, start), end - start
         return (jnp.clip(-dot(p, along) / jnp.maximum(dot(along, along), SMALLEST_LENGTH_SQUARED), 0.0, 1.0),)
 
+    def relative(
+        self, t: ArrayLike, position: Float[Array, "*lanes dim"], velocity: Float[Array, "*lanes dim"]
+    ) -> Float[Array, "*lanes dim"]:
+        """Velocities relative to the center [m/s]: how a ball turns does not change the distance."""
+        if self.motion is None:
+            return super().relative(t, position, velocity)
+        return velocity - self.motion.velocity_at(t, self.motion.place(t, broadcast_vector(self.center, position)))
+
     def _offset(self, t: ArrayLike, position: Array) -> Array:
         """From the center to positions [m]."""
-        return self._to_rest_frame(t, position) - broadcast_vector(self.center, position)
+        center = broadcast_vector(self.center, position)
+        if self.motion is not None:
+            return position - self.motion.place(t, center)
+        return self.rest_place(t, position) - center
 
 
 class Room(Surface):
@@ -328,6 +351,7 @@ class Room(Surface):
             friction=self.friction,
             coulomb=self.coulomb,
             velocity=self.velocity,
+            motion=self.motion,
         )
 
     def remember_since(self: R, since: list[Array]) -> R:

@@ -17,6 +17,7 @@ from physjax.old_names import serve_old_names
 from physjax.particles import Particles
 from physjax.parts import Contact
 from physjax.physics.contacts.face import LowestPoint
+from physjax.physics.contacts.motion import Motion
 from physjax.physics.contacts.path_search import bound_path_length, find_path_dip
 from physjax.physics.contacts.restitution import Coulomb, apply_restitution
 from physjax.physics.contacts.time_of_impact import impact
@@ -43,12 +44,14 @@ class Surface(Contact):
     What turns within itself has an `angular_velocity` Ω [rad/s], a vector in space and a number in the plane (> 0:
     anticlockwise): friction then sees velocity + Ω×r, with r from the axis. The axis goes through the point of a plane or
     slab, along its normal (a turntable), and through the center of a sphere (a drum, a ball that spins); that of a shape
-    of your own, which must be round about it, goes through `axis_point`.
+    of your own, which must be round about it, goes through `axis_point`. What is led along a path or about an axis, as
+    functions of time, has a `motion` instead.
 
     A shape of your own is a subclass with a `signed_distance(t, position)` and nothing else: its normal and curvature
-    follow by differentiation. Override `normal_at` and `curvature_acceleration` where closed forms are known. The
-    distance must be right to first order at the surface, where its gradient has length 1, and must nowhere be greater
-    than the true one, or the search for impacts may step over something thin.
+    follow by differentiation. It measures from `self.rest_place(t, position)` if it is to move. Override `normal_at` and
+    `curvature_acceleration` where closed forms are known. The distance must be right to first order at the surface,
+    where its gradient has length 1, and must nowhere be greater than the true one, or the search for impacts may step
+    over something thin.
 
     Example:
         >>> floor = contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.5, friction=0.25)
@@ -65,6 +68,7 @@ class Surface(Contact):
     angular_velocity: OptionalNumbers = quantity(
         "angular velocity of the surface", "rad/s", kind="axial", default=None, kw_only=True
     )
+    motion: Motion | None = eqx.field(default=None, kw_only=True)
     # a field or a property where other contacts have a class attribute: all are read the same way
     response: Callable[..., Scene] | None = eqx.field(  # pyright: ignore[reportIncompatibleVariableOverride]
         static=True, default=None, kw_only=True
@@ -85,6 +89,16 @@ class Surface(Contact):
                 f"coulomb: got {self.coulomb!r}, expected contacts.Coulomb(static=0.5, kinetic=0.4): a contact sticks up to the "
                 "one and slips against the other."
             )
+        if self.motion is not None and not isinstance(self.motion, Motion):
+            raise TypeError(
+                f"motion: got {self.motion!r}, expected contacts.Motion(displacement=lambda t: ...), or velocity= where the "
+                "surface moves uniformly."
+            )
+        if self.motion is not None and (self.velocity is not None or self.angular_velocity is not None):
+            raise ValueError(
+                f"{type(self).__name__}: got motion= and velocity= or angular_velocity=, expected one of them: a motion has "
+                "its own velocity."
+            )
         if self.response is not None and not callable(self.response):
             raise TypeError(f"response: got {self.response!r}, expected contacts.impact, contacts.project or None.")
 
@@ -104,8 +118,28 @@ class Surface(Contact):
         # the sum has each lane's own gradient, because no lane's distance depends on another lane
         return unit(jax.grad(lambda x: jnp.sum(self.signed_distance(t, x)))(position))
 
-    def relative(self, velocity: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
-        """Velocities relative to the surface as a whole, without its turning, which does not change the distance [m/s]."""
+    def rest_place(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """Positions in the frame in which the surface stands where it was given [m]."""
+        if self.motion is not None:
+            return self.motion.rest_place(t, position)
+        return position if self.velocity is None else position - scale(t, broadcast_vector(self.velocity, position))
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves, or turns within itself."""
+        return not (self.velocity is None and self.angular_velocity is None and self.motion is None)
+
+    @property
+    def accelerates(self) -> bool:
+        """Whether what sticks to it is accelerated: it turns, or has a motion."""
+        return not (self.angular_velocity is None and self.motion is None)
+
+    def relative(
+        self, t: ArrayLike, position: Float[Array, "*lanes dim"], velocity: Float[Array, "*lanes dim"]
+    ) -> Float[Array, "*lanes dim"]:
+        """Velocities relative to the surface, less what turns it within itself, which does not change the distance [m/s]."""
+        if self.motion is not None:
+            return velocity - self.motion.velocity_at(t, position)
         return velocity if self.velocity is None else velocity - broadcast_vector(self.velocity, velocity)
 
     def axis_point(self, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
@@ -114,6 +148,8 @@ class Surface(Contact):
 
     def velocity_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
         """The velocity of the surface itself at positions on it, v + Ω×r [m/s]; None where it does not move."""
+        if self.motion is not None:
+            return self.motion.velocity_at(t, position)
         turning = None if self.angular_velocity is None else spin(self.angular_velocity, self._arm(t, position))
         if self.velocity is None:
             return turning
@@ -121,14 +157,22 @@ class Surface(Contact):
         return velocity if turning is None else velocity + turning
 
     def acceleration_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
-        """The acceleration of what sticks to the surface there, Ω×(Ω×r) [m/s²]; None where it does not turn."""
+        """The acceleration of what sticks to the surface there, Ω×(Ω×r) or the motion's [m/s²]; None where it has none."""
+        if self.motion is not None:
+            return self.velocity_rate(t, position, self.motion.velocity_at(t, position))
         if self.angular_velocity is None:
             return None
         return spin(self.angular_velocity, spin(self.angular_velocity, self._arm(t, position)))
 
-    def velocity_rate(self, velocity: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
-        """How fast `velocity_at` changes at a place that moves with a velocity, Ω×ẋ [m/s²]; None where it does not turn."""
-        return None if self.angular_velocity is None else spin(self.angular_velocity, self.relative(velocity))
+    def velocity_rate(
+        self, t: ArrayLike, position: Float[Array, "*lanes dim"], velocity: Float[Array, "*lanes dim"]
+    ) -> Float[Array, "*lanes dim"] | None:
+        """How fast `velocity_at` changes at a place that moves with a velocity, Ω×ẋ [m/s²]; None where it does not."""
+        if self.motion is not None:
+            return _differentiate_along(self.motion.velocity_at, t, position, velocity)
+        if self.angular_velocity is None:
+            return None
+        return spin(self.angular_velocity, self.relative(t, position, velocity))
 
     def slip(self, t: ArrayLike, state: Particles) -> Float[Array, "*lanes dim"]:
         """Velocities relative to the surface where each lane is, turning included [m/s]: what friction sees."""
@@ -141,8 +185,21 @@ class Surface(Contact):
             return jnp.zeros_like(relative[..., 0])
         return dot(relative, self.normal_rate(t, position, relative))
 
+    def distance_acceleration(self, t: ArrayLike, state: Particles) -> Array:
+        """The second time derivative of the signed distance of lanes that are not accelerated [m/s²].
+
+        That is due to curvature, and to the motion of the surface.
+        """
+        x, v = state
+        if self.motion is None:
+            return self.curvature_acceleration(t, x, self.relative(t, x, v))
+        return _differentiate_along(lambda t, x: dot(self.normal_at(t, x), self.relative(t, x, v)), t, x, v)
+
     def normal_rate(self, t: ArrayLike, position: Array, relative: Array) -> Array:
         """How fast the normal turns under a lane that moves over the surface, v·∇n [1/s], by differentiation."""
+        if self.motion is not None:
+            velocity = relative + self.motion.velocity_at(t, position)
+            return _differentiate_along(self.normal_at, t, position, velocity)
         return jax.jvp(lambda x: self.normal_at(t, x), (position,), (relative,))[1]
 
     def facing(self, t: ArrayLike, position: Array) -> "Surface":
@@ -200,13 +257,13 @@ class Surface(Contact):
             return dips
         # a path shorter than both distances together cannot get to the surface and away again
         free = self.signed_distance(t, start.position) + self.signed_distance(t + dt, end.position)
-        return dips | (free < bound_path_length(self, dt, start, end))
+        return dips | (free < bound_path_length(self, t, dt, start, end))
 
     def may_dip_as_cubic(self, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Bool[Array, "*lanes"]:
         """The same of a distance that is a cubic in time, which stays above the lowest of its four Bézier points."""
         d0, d1 = self.signed_distance(t, start.position), self.signed_distance(t + dt, end.position)
-        r0 = dt * dot(self.relative(start.velocity), self.normal_at(t, start.position))
-        r1 = dt * dot(self.relative(end.velocity), self.normal_at(t + dt, end.position))
+        r0 = dt * dot(self.relative(t, *start), self.normal_at(t, start.position))
+        r1 = dt * dot(self.relative(t + dt, *end), self.normal_at(t + dt, end.position))
         # the first point, d0, is left out: a lane that has just bounced is at zero and would always count
         return jnp.minimum(jnp.minimum(d0 + r0 / 3, d1 - r1 / 3), d1) < 0
 
@@ -218,6 +275,8 @@ class Surface(Contact):
 
     def prepare(self, state: Particles, couples: bool) -> "Surface":
         """The surface as part of a scene: with its response, and, for `impact`, which lanes begin in contact."""
+        if self.motion is not None:
+            self.motion.demand_fit(type(self).__name__, state.position.shape[-1])
         response = self.response or (project if couples else impact)
         if response is not impact:
             return replace(self, response=response)
@@ -243,21 +302,23 @@ class Surface(Contact):
 
     def _arm(self, t: ArrayLike, position: Array) -> Array:
         """From the axis to positions [m]."""
-        return self._to_rest_frame(t, position) - self.axis_point(position)
-
-    def _to_rest_frame(self, t: ArrayLike, position: Array) -> Array:
-        """Positions in the frame in which the surface stands where it is at t = 0."""
-        return position if self.velocity is None else position - scale(t, broadcast_vector(self.velocity, position))
+        return self.rest_place(t, position) - self.axis_point(position)
 
 
 serve_old_names(Surface, OLD_NAMES)
+
+
+def _differentiate_along(function: Callable, t: ArrayLike, position: Array, velocity: Array) -> Array:
+    """How fast a function of time and place changes at places that move with a velocity."""
+    time = jnp.asarray(t, position.dtype)
+    return jax.jvp(function, (time, position), (jnp.ones_like(time), velocity))[1]
 
 
 @jax.jit  # one compilation instead of one for each operation
 def _find_contact_start(wall: Surface, state: Particles) -> Array:
     """Since when each lane is in contact: from t = 0 if it begins on the surface and does not leave, else never (∞)."""
     (x, v), rounding = state, CONTACT_START_ROUNDING * float(jnp.finfo(state.dtype).eps)
-    relative = wall.relative(v)
+    relative = wall.relative(0.0, x, v)
     normal_speed = dot(relative, wall.normal_at(0.0, x))
     on = jnp.abs(wall.signed_distance(0.0, x)) <= rounding * norm(x)
     along = normal_speed * normal_speed <= rounding**2 * dot(v, v)

@@ -41,19 +41,19 @@ class Surfaces(eqx.Module):
         return sum(stack.size for stack in self.stacks)
 
     @property
-    def curved(self) -> bool:
-        """Whether any of them is."""
-        return any(stack.part.curved for stack in self.stacks)
+    def bends(self) -> bool:
+        """Whether the distance to any of them has a second derivative of its own: it is curved, or has a motion."""
+        return any(stack.part.curved or stack.part.motion is not None for stack in self.stacks)
 
     @property
     def moves(self) -> np.ndarray:
         """Which of them move, or turn within themselves."""
-        return self._mark(lambda part: part.velocity is not None or part.angular_velocity is not None)
+        return self._mark(lambda part: part.moves)
 
     @property
-    def turns(self) -> np.ndarray:
-        """Which of them turn."""
-        return self._mark(lambda part: part.angular_velocity is not None)
+    def accelerates(self) -> np.ndarray:
+        """Which of them accelerate what sticks to them."""
+        return self._mark(lambda part: part.accelerates)
 
     @property
     def rough(self) -> np.ndarray:
@@ -90,8 +90,8 @@ class Surfaces(eqx.Module):
         return map_stacks(lambda part: _or_zero(part.velocity_at(t, position), position), self.stacks)
 
     def acceleration_at(self, t: ArrayLike, position: Array) -> Array | None:
-        """The accelerations of what sticks to them [m/s²]; None where none turns."""
-        if not self.turns.any():
+        """The accelerations of what sticks to them [m/s²]; None where none has any."""
+        if not self.accelerates.any():
             return None
         return map_stacks(lambda part: _or_zero(part.acceleration_at(t, position), position), self.stacks)
 
@@ -100,12 +100,11 @@ class Surfaces(eqx.Module):
         x = state.position
         return Touch(self.signed_distance(t, x), self.normal_at(t, x), self.velocity_at(t, x))
 
-    def curvature_acceleration(self, t: ArrayLike, state: Particles) -> Array | None:
-        """What the curvature adds to the second time derivative of the signed distances [m/s²]; None if all are flat."""
-        if not self.curved:
+    def distance_acceleration(self, t: ArrayLike, state: Particles) -> Array | None:
+        """The second time derivatives of the signed distances of lanes that are not accelerated [m/s²]; None if all are zero."""
+        if not self.bends:
             return None
-        turn = lambda part: part.curvature_acceleration(t, state.position, part.relative(state.velocity))  # noqa: E731
-        return map_stacks(turn, self.stacks)
+        return map_stacks(lambda part: part.distance_acceleration(t, state), self.stacks)
 
     def may_meet(self, since: Array, t: ArrayLike, dt: ArrayLike, start: Particles, end: Particles) -> Array:
         """Whether a lane may meet any of them within a step, or stop where it slides: cheap, true of every lane that does."""

@@ -93,7 +93,9 @@ class PointContact(Contact):
         """Unit vector away from the surface."""
 
     @abstractmethod
-    def relative(self, velocity: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    def relative(
+        self, t: ArrayLike, position: Float[Array, "*lanes 3"], velocity: Float[Array, "*lanes 3"]
+    ) -> Float[Array, "*lanes 3"]:
         """Velocities relative to the surface [m/s]."""
 
     @abstractmethod

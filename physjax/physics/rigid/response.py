@@ -82,7 +82,7 @@ def _call_functions(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> PyT
 def _find_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> RigidBodies:
     """The bodies after a step, found without derivatives."""
     kinds = stack_body_contacts(scene)
-    return _invalidate_overrun_lanes(kinds, find_impacts(motion, scene, kinds, t, dt)[0], t, dt)
+    return _carry_waiting_bodies(kinds, find_impacts(motion, scene, kinds, t, dt)[0], t, dt)
 
 
 def _log_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[RigidBodies, Record]:
@@ -90,7 +90,7 @@ def _log_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[Rigi
     kinds = stack_body_contacts(scene)
     progress, legs, log = find_impacts(motion, scene, kinds, t, dt, logged=True)
     assert log is not None
-    return _invalidate_overrun_lanes(kinds, progress, t, dt), record_legs(log, legs)
+    return _carry_waiting_bodies(kinds, progress, t, dt), record_legs(log, legs)
 
 
 def fold_body_flights(
@@ -120,24 +120,34 @@ def _build_whole_flight(
     return Flight(scene.state, start, shared(leg_start), shared(dt), end, after, None)
 
 
-def _invalidate_overrun_lanes(
-    kinds: tuple[ContactKind, ...], progress: Progress, t: Time, dt: ArrayLike
-) -> RigidBodies:
-    """The bodies after a step; those that wait where a surface has moved over them become NaN."""
+def _carry_waiting_bodies(kinds: tuple[ContactKind, ...], progress: Progress, t: Time, dt: ArrayLike) -> RigidBodies:
+    """The bodies after a step: those that wait where a surface moves over them are moved along by it.
+
+    Where it moves them into another surface there is no way out: those become NaN.
+    """
     moving = tuple(kind for kind in kinds if kind.part.moves)
     if not moving:
         return progress.state
 
-    def find_overrun() -> Array:
-        state = progress.state
-        leg_start, end = to_float_time(t + progress.elapsed), to_float_time(t + dt)
-        over = jnp.zeros(progress.arrived.shape, bool)
-        for kind in face_surfaces(moving, leg_start, state):
-            before, after = (kind.map(lambda contact, t=t: contact.clearance(t, state)) for t in (leg_start, end))
-            over = over | jnp.any(has_moved_over(before, after, state.position[None]), axis=0)
-        return over & ~progress.arrived
+    def carry() -> RigidBodies:
+        state, end = progress.state, to_float_time(t + dt)
+        leg_start = to_float_time(t + progress.elapsed)
+        waits, moved = ~progress.arrived, state
+        faces = face_surfaces(kinds, leg_start, state)
+        before = _measure_clearances(faces, leg_start, state)
+        over = has_moved_over(before, _measure_clearances(faces, end, state), state.position[None])
+        for kind in faces:
+            moved = _move_out(kind, end, moved)
+        state = choose_lanes(waits & jnp.any(over, axis=0), moved, state)
+        stuck = has_moved_over(before, _measure_clearances(faces, end, state), state.position[None])
+        return invalidate_lanes(waits & jnp.any(stuck, axis=0), state)
 
-    return invalidate_lanes(materialise_where(~progress.arrived, find_overrun), progress.state)
+    return materialise_where(~progress.arrived, carry, progress.state)
+
+
+def _measure_clearances(kinds: tuple[ContactKind, ...], t: ArrayLike, state: RigidBodies) -> Array:
+    """How far each body is from each surface at a time [m]."""
+    return jnp.concatenate([kind.map(lambda contact: contact.clearance(t, state)) for kind in kinds])
 
 
 def _resolve_at_step_end(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> tuple[RigidBodies, Leg]:

@@ -87,8 +87,8 @@ class SurfaceContact(PointContact):
         touch = Particles(bodies.position[None] + low, straight + cross(omega, low))
         points = Points(low, normal, self.surface.slip(time, touch), friction)
         turning, moves = None, center.velocity
-        if self.surface.curved:
-            along = self.surface.relative(center.velocity)
+        if self.surface.curved or self.surface.motion is not None:
+            along = self.surface.relative(time, where, center.velocity)
             turning = self.surface.normal_rate(time, where, along), self._radius(arm)
             moves = moves - scale(turning[1], turning[0])
         return ContactPointState(
@@ -97,7 +97,7 @@ class SurfaceContact(PointContact):
             self.signed_distance(time, where),
             per_point(self.surface.restitution),
             turning,
-            self.surface.velocity_rate(moves),
+            self.surface.velocity_rate(time, touch.position, moves),
         )
 
     def walls(self) -> tuple["SurfaceContact", ...]:
@@ -118,14 +118,17 @@ class SurfaceContact(PointContact):
         """Unit vector away from the surface."""
         return self.surface.normal_at(t, position)
 
-    def relative(self, velocity: Float[Array, "*lanes 3"]) -> Float[Array, "*lanes 3"]:
+    def relative(
+        self, t: ArrayLike, position: Float[Array, "*lanes 3"], velocity: Float[Array, "*lanes 3"]
+    ) -> Float[Array, "*lanes 3"]:
         """Velocities relative to the surface [m/s]."""
-        return self.surface.relative(velocity)
+        return self.surface.relative(t, position, velocity)
 
     @property
     def moves(self) -> bool:
-        """Whether the surface may be elsewhere at another time: the library's own move with their velocity, if at all."""
-        return self.surface.velocity is not None or not is_library_part(type(self.surface))
+        """Whether the surface may be elsewhere at another time: the library's own only where they are led."""
+        led = self.surface.velocity is not None or self.surface.motion is not None
+        return led or not is_library_part(type(self.surface))
 
     @property
     def narrow(self) -> bool:

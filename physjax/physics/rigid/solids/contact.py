@@ -111,9 +111,10 @@ class Solids(Contact):
                     "Solids: got a surface with friction= or response=, expected coulomb=Coulomb(static, kinetic) or "
                     "nothing: the others are for particles."
                 )
-            if surface.angular_velocity is not None:
+            if surface.angular_velocity is not None or surface.motion is not None:
                 raise ValueError(
-                    "Solids: got a surface with angular_velocity=, expected one that does not turn: use velocity=, or a body."
+                    "Solids: got a surface with angular_velocity= or motion=, expected one that stands or moves uniformly: "
+                    "use velocity=, or a body."
                 )
 
     @property
