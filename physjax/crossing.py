@@ -4,7 +4,7 @@ Between two frames the run is stepped again from the first of them, so the resul
 moment within the step is a root along the method's own path; it moves with every number that the run depends on.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import any_lane
-from physjax.checks import Numbers, quantity
+from physjax.checks import Numbers, as_positive_integer, quantity
 from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
@@ -33,7 +33,7 @@ NODES_PER_BATCH = 64
 
 
 class Crossing(NamedTuple):
-    """Time [s], position [m] and velocity [m/s] of each lane's first crossing; where it has none, `ok` False and NaN."""
+    """Time [s], position [m] and velocity [m/s] of a crossing of each lane; where it has none, `ok` False and NaN."""
 
     time: Float[Array, "*lanes"]
     position: Float[Array, "*lanes dim"]
@@ -93,7 +93,9 @@ class Distanced(Protocol):
 
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 @announce_compiling("the crossing")
-def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> Crossing | BodyCrossing:
+def find_crossing(
+    run: PyTree, surface: PyTree, direction: int | None, nth: int | Sequence[int]
+) -> Crossing | BodyCrossing:
     """See `Trajectory.crossing`; `run` is a trajectory that knows its scene and its method."""
     if direction not in (None, 1, -1):
         raise ValueError(
@@ -102,28 +104,40 @@ def find_first_crossing(run: PyTree, surface: PyTree, direction: int | None) -> 
     if not isinstance(surface, Distanced):
         warn_of_recompilation("crossing", [surface])
         surface = as_module(surface) if callable(surface) else Height(surface, run.scene.up)
-    found = _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32))
+    many = not isinstance(nth, int)
+    numbers = [as_positive_integer("nth", number) for number in (nth if many else [nth])]
+    if not numbers:
+        raise ValueError("nth: got no number, expected which crossings are wanted, such as 2 or range(1, 4).")
+    wanted = jnp.asarray(numbers if many else numbers[0], jnp.int32)
+    found = _find_crossings(run, surface, jnp.asarray(direction or 0, jnp.int32), wanted)
     return Crossing(*found[:-1]) if isinstance(found.state, Particles) else found
 
 
 @eqx.filter_jit
-def _find_crossings(run: PyTree, surface: PyTree, way: Array) -> BodyCrossing:
-    find = lambda run: _find_run_crossings(run, surface, way)  # noqa: E731
+def _find_crossings(run: PyTree, surface: PyTree, way: Array, nth: Array) -> BodyCrossing:
+    find = lambda run, nth: _find_run_crossings(run, surface, _Wanted(way, nth))  # noqa: E731
     for _ in range(run.first_step.ndim):  # runs that came out of vmap
-        find = jax.vmap(find)
-    return find(run)
+        find = jax.vmap(find, in_axes=(0, None))
+    return lax.map(lambda number: find(run, number), nth) if nth.ndim else find(run, nth)
 
 
-def _find_run_crossings(run: PyTree, surface: PyTree, way: Array) -> BodyCrossing:
+class _Wanted(NamedTuple):
+    """Which crossing is wanted: in which direction (0: in either), and which of these, from 1."""
+
+    way: Array
+    nth: Array
+
+
+def _find_run_crossings(run: PyTree, surface: PyTree, wanted: _Wanted) -> BodyCrossing:
     scene, measure = run.scene, _build_measure(surface, run.scene)
     scenes = len(scene.status_shape)
     # one ball is tied to nobody, whatever its forces say; a measure of a whole scene is one for all of its bodies
     if jax.eval_shape(measure, jnp.zeros(scene.status_shape, scene.state.dtype), scene.state).ndim == scenes:
-        return _find_unit_crossings(run, measure, way, lambda leaf: leaf)
+        return _find_unit_crossings(run, measure, wanted, lambda leaf: leaf)
 
     def of_node(n):
         at_node = lambda leaf: jnp.take(leaf, n, axis=scenes)  # noqa: E731
-        return _find_unit_crossings(run, lambda t, state: measure(t, state)[..., n], way, at_node)
+        return _find_unit_crossings(run, lambda t, state: measure(t, state)[..., n], wanted, at_node)
 
     # a node's moment is its own, and the whole scene is stepped to it
     count = scene.state.lanes[-1]
@@ -134,13 +148,17 @@ def _find_run_crossings(run: PyTree, surface: PyTree, way: Array) -> BodyCrossin
 
 
 class _CrossingStep(NamedTuple):
-    """The step in which a crossing was found, counted from a frame, and the signed distances at both its ends."""
+    """The step in which a crossing was found, counted from a frame, and the signed distances at both its ends.
+
+    `passed` counts the crossings up to it.
+    """
 
     frame: Array
     step: Array
     before: Array
     after: Array
     found: Array
+    passed: Array
 
 
 class _Replay(NamedTuple):
@@ -195,10 +213,10 @@ def _measure_size(state: PyTree, axes: int) -> Array:
     return jnp.max(jnp.stack(largest), axis=0)
 
 
-def _find_unit_crossings(run: PyTree, measure: Callable, way: Array, own: Callable) -> BodyCrossing:
-    """The first crossing of every lane or, in a coupled scene, of the node in every scene that `own` picks."""
+def _find_unit_crossings(run: PyTree, measure: Callable, wanted: _Wanted, own: Callable) -> BodyCrossing:
+    """The wanted crossing of every lane or, in a coupled scene, of the node in every scene that `own` picks."""
     replay = _build_replay(run, measure)
-    place = _find_crossing_step(replay.stop_gradients(), way)
+    place = _find_crossing_step(replay.stop_gradients(), wanted)
     moving = replay.take_frame(place.frame)
 
     def forward(i, moving):
@@ -244,10 +262,10 @@ def _build_replay(run: PyTree, measure: Callable) -> _Replay:
     return _Replay(frames, step, measure, rate, run.first_step, run.save_every, dt)
 
 
-def _find_crossing_step(replay: _Replay, way: Array) -> _CrossingStep:
-    """Frame and step of the first crossing, by stepping again between the frames that may bracket one."""
+def _find_crossing_step(replay: _Replay, wanted: _Wanted) -> _CrossingStep:
+    """Frame and step of the wanted crossing, by stepping again between the frames that may bracket one."""
     shape, zero = replay.dt.shape, jnp.zeros(replay.dt.shape, jnp.int32)
-    candidates = _find_candidate_intervals(replay, way)
+    candidates = _find_candidate_intervals(replay, wanted.way)
     numbers = jnp.arange(len(candidates), dtype=jnp.int32).reshape(-1, *(1 for _ in shape))
     ahead = lambda cursor: candidates & (numbers >= cursor[None])  # noqa: E731
 
@@ -258,37 +276,36 @@ def _find_crossing_step(replay: _Replay, way: Array) -> _CrossingStep:
     def look(carry):
         cursor, place = carry
         frame = jnp.argmax(ahead(cursor), axis=0).astype(jnp.int32)
-        seen = _search_interval(replay, frame, way)
-        new = seen.found & jnp.any(ahead(cursor), axis=0) & ~place.found
-        return frame + 1, jax.tree.map(lambda a, b: jnp.where(new, a, b), seen, place)
+        seen = _search_interval(replay, frame, place.passed, wanted)
+        more = jnp.any(ahead(cursor), axis=0)
+        new = more & ~place.found
+        # a lane that has searched all of its own waits for the others
+        return jnp.where(more, frame + 1, cursor), jax.tree.map(lambda a, b: jnp.where(new, a, b), seen, place)
 
     nothing = jnp.zeros(shape, replay.dt.dtype)
-    place = _CrossingStep(zero, zero, nothing + 1.0, nothing - 1.0, jnp.zeros(shape, bool))
+    place = _CrossingStep(zero, zero, nothing + 1.0, nothing - 1.0, jnp.zeros(shape, bool), zero)
     return lax.while_loop(going, look, (zero, place))[1]
 
 
-def _search_interval(replay: _Replay, frame: Array, way: Array) -> _CrossingStep:
-    """The first step after a frame over which the signed distance changes its sign."""
+def _search_interval(replay: _Replay, frame: Array, passed: Array, wanted: _Wanted) -> _CrossingStep:
+    """The step after a frame over which the signed distance changes its sign for the wanted time, so many having passed."""
 
     def one(i, carry):
         moving, before, place = carry
         t = replay.moment(frame, i)
         moving = replay.step(moving, t, replay.dt)
         after = replay.measure_distance(to_float_time(t + replay.dt), moving)
-        here = _crosses(before, after, way) & ~place.found
-        new = _CrossingStep(frame, jnp.full_like(frame, i), before, after, here)
-        return moving, after, jax.tree.map(lambda a, b: jnp.where(here, a, b), new, place)
+        crosses = _crosses(before, after, wanted.way) & ~place.found
+        passed = place.passed + crosses.astype(jnp.int32)
+        here = crosses & (passed == wanted.nth)
+        new = _CrossingStep(frame, jnp.full_like(frame, i), before, after, here, passed)
+        place = jax.tree.map(lambda a, b: jnp.where(here, a, b), new, place)
+        return moving, after, place._replace(passed=passed)
 
     moving = replay.take_frame(frame)
-    signed_distance = replay.measure_distance(to_float_time(replay.moment(frame, 0)), moving)
-    start = (
-        moving,
-        signed_distance,
-        _CrossingStep(
-            frame, jnp.zeros_like(frame), signed_distance, signed_distance, jnp.zeros(signed_distance.shape, bool)
-        ),
-    )
-    return lax.fori_loop(0, replay.steps_per_frame, one, start)[2]
+    distance = replay.measure_distance(to_float_time(replay.moment(frame, 0)), moving)
+    nowhere = _CrossingStep(frame, jnp.zeros_like(frame), distance, distance, jnp.zeros(distance.shape, bool), passed)
+    return lax.fori_loop(0, replay.steps_per_frame, one, (moving, distance, nowhere))[2]
 
 
 def _find_candidate_intervals(replay: _Replay, way: Array) -> Bool[Array, "intervals *lanes"]:

@@ -1,7 +1,7 @@
 """What a run returns: frames over time, a status per lane, and enough memory of the run to step again inside it."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from physjax.checks import concrete_or_none
-from physjax.crossing import BodyCrossing, Crossing, find_first_crossing
+from physjax.crossing import BodyCrossing, Crossing, find_crossing
 from physjax.files import RUN_FORMAT, demand_saved_run, read_arrays, write_atomically
 from physjax.lazy import call_late
 from physjax.loops import moment_at
@@ -210,8 +210,13 @@ class Trajectory(eqx.Module):
         """
         return build_frame_table(self)
 
-    def crossing(self, surface: PyTree, *, direction: int | None = None) -> Crossing | BodyCrossing:
+    def crossing(
+        self, surface: PyTree, *, direction: int | None = None, nth: int | Sequence[int] = 1
+    ) -> Crossing | BodyCrossing:
         """Time, position and velocity of the first crossing of a surface, for each lane; `ok` False where there is none.
+
+        `nth=2` is the second crossing, of those in the `direction` if there is one; `nth=range(1, 4)` are the first three,
+        along an axis in front.
 
         `surface` is a height [m] along the scene's `up`, a number or one per lane; anything with a `gap(t, position)`, such as
         `contacts.Plane`; or a function `(t, position) -> signed distance` [m], one for each lane, with t a scalar or per
@@ -233,9 +238,11 @@ class Trajectory(eqx.Module):
             >>> landing = flight.crossing(0.0, direction=-1)
             >>> round(float(landing.time), 3), round((4.0 + (4.0**2 + 2 * 9.8 * 10.0) ** 0.5) / 9.8, 3)
             (1.894, 1.894)
+            >>> bool(flight.crossing(0.0, nth=2).ok)
+            False
         """
         self._demand_scene("crossing")
-        return find_first_crossing(self, surface, direction)
+        return find_crossing(self, surface, direction, nth)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the run as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent.

@@ -73,6 +73,28 @@ def test_upward_downward_or_whichever_comes_first():
     assert up.velocity[1] > 0 > down.velocity[1]
 
 
+def test_later_crossings_are_counted_and_move_with_the_stiffness():
+    """x = cos ωt is zero at (n - ½)π/ω, and goes up there every other time."""
+    start = Particles(jnp.ones((2, 1)), jnp.zeros((2, 1)))
+
+    def moments(stiffness, direction=None, nth=(1, 2, 3)):
+        scene = Scene(start, 1.0, (forces.Anchor((0.0,), stiffness),))
+        run = simulate(scene, methods.rk4, dt=0.01, steps=300, save_every=30)
+        found = run.crossing(0.0, direction=direction, nth=nth)
+        return found.time, found.ok
+
+    stiffness = jnp.array([25.0, 4.0])
+    rate = np.sqrt(stiffness)
+    time, ok = moments(stiffness, nth=(1, 2, 3, 4, 5))
+    right = (np.arange(5)[:, None] + 0.5) * np.pi / rate
+    np.testing.assert_array_equal(ok, right < 3.0)
+    np.testing.assert_allclose(time, np.where(right < 3.0, right, np.nan), atol=1e-7)
+    up, _ = moments(stiffness, direction=1, nth=2)
+    np.testing.assert_allclose(up[0], 3.5 * np.pi / rate[0], atol=1e-7)
+    slope = jax.jacfwd(lambda k: moments(k, nth=2)[0])(stiffness)
+    np.testing.assert_allclose(np.diag(slope), -right[1] / (2 * stiffness), rtol=1e-6)
+
+
 def test_each_lane_may_have_its_own_height_and_those_that_miss_say_so():
     at = thrown(SPEEDS).crossing([1.0, 20.0, 2.0])
     np.testing.assert_array_equal(at.ok, [True, False, True])
