@@ -180,6 +180,30 @@ class Springs(Force):
             )
         return eqx.tree_at(lambda springs: springs.intact, self, intact), state
 
+    def cut(self, where: NestedArrayLike) -> "Springs":
+        """The springs without some, for good: a mask `(springs,)`, or `(*scenes, springs)` for a sweep of cuts.
+
+        Go on with them from where a run ended: `scene = run.final_scene`, whose forces are replaced. Programs stay as they
+        are, since the springs keep their places. Raises ValueError for a mask that does not fit.
+
+        Example:
+            >>> chain = springs.Springs([[0, 1], [1, 2]], stiffness=10.0, rest_length=1.0)
+            >>> hanging = Particles(jnp.array([[0.0, 0.0], [0.0, -2.0], [0.0, -4.0]]), jnp.zeros((3, 2)))
+            >>> print(chain.cut([False, True]).tension(hanging))
+            [10.  0.]
+        """
+        mask = jnp.asarray(where)
+        if mask.dtype != bool or mask.shape[-1:] != (len(self.pairs),):
+            raise ValueError(
+                f"cut: got {mask.dtype} of shape {mask.shape}, expected a mask, booleans of shape ({len(self.pairs)},): one "
+                "for each spring."
+            )
+        held = self.topology.spread(~mask)  # what is in no slot is spread as False
+        if self.intact is not None:
+            shape = jnp.broadcast_shapes(held.shape, self.intact.shape)
+            held = jnp.broadcast_to(held, shape) & jnp.broadcast_to(self.intact, shape)
+        return eqx.tree_at(lambda springs: springs.intact, self, held, is_leaf=lambda leaf: leaf is None)
+
     def length(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """Length l of each spring [m]."""
         return norm(self._edge_vectors(state.position))

@@ -49,6 +49,18 @@ CASES = {
     ),
     "Magnus": Case(forces.Magnus, {"area": 0.1, "coefficient": 0.4, "density": 1.2}, WIND | {"axis": [1.0, 2, -3]}, 3),
     "Magnus in the plane": Case(forces.Magnus, {"area": 0.1, "coefficient": 0.4, "axis": -2.0}, {}, 2),
+    "SpinLift": Case(forces.SpinLift, {"radius": 0.3, "density": 1.2}, WIND | {"angular_velocity": [1.0, 2, -3]}, 3),
+    "SpinLift in the plane": Case(forces.SpinLift, {"radius": 0.3, "angular_velocity": -2.0}, {}, 2),
+    "InAir": Case(
+        lambda **n: forces.InAir(
+            forces.QuadraticDrag(**n),
+            wind=lambda t, x: 0.5 * x,
+            thinning=lambda t, x: jnp.exp(-0.2 * x[..., 1]),
+        ),
+        {"area": 0.1, "coefficient": 0.4},
+        WIND,
+        3,
+    ),
     "Buoyancy": Case(forces.Buoyancy, {"density": 1e3, "volume": 1e-3, "g": 9.8}, {}, 2),
     "Buoyancy at a surface": Case(forces.Buoyancy, {"density": 1e3, "radius": 0.8, "surface": 0.1, "g": 9.8}, {}, 2),
     "Lorentz": Case(forces.Lorentz, {"charge": 0.3}, {"magnetic": [1.0, 2.0, -3.0], "electric": [0.2, 0.0, 0.5]}, 3),

@@ -347,3 +347,25 @@ def test_the_number_of_nodes_must_be_the_scene_s(unannotated):
         Springs([[0, 1], [0, 3]], 1.0, 1.0, nodes=3)
     with pytest.raises(ValueError, match=r"layout: got 'lists', expected one of bands, gather"):
         Springs([[0, 1]], 1.0, 1.0, layout="lists")
+
+
+@LAYOUTS
+def test_what_is_cut_falls_freely_and_the_rest_holds(layout):
+    """Two weights one below the other, each at rest on its spring: below the cut one falls, the upper swings about its own."""
+    chain = Springs([[0, 1], [1, 2]], 100.0, 1.0, nodes=3, layout=layout, breaks_at=2.0)
+    sag = G / 100.0 * np.array([0.0, 2.0, 3.0])
+    place = jnp.asarray(np.stack([np.zeros(3), -np.arange(3) - sag], axis=-1))
+    cut = chain.cut(np.array([[False, True], [False, False], [True, False]]))
+    start = Particles(jnp.broadcast_to(place, (3, 3, 2)), jnp.zeros((3, 3, 2)))
+    pinned = jnp.broadcast_to(jnp.arange(3) == 0, (3, 3))
+    run = simulate(Scene(start, 1.0, (forces.Gravity(G), cut), pinned=pinned), methods.rk4, dt=1e-3, steps=300)
+    t, y = np.asarray(run.time), np.asarray(run.position[..., 1])
+    np.testing.assert_allclose(y[:, 0, 2], place[2, 1] - G * t**2 / 2, atol=1e-12)
+    np.testing.assert_allclose(y[:, 0, 1], -1 - G / 100 * (1 + np.cos(10 * t)), atol=1e-9)
+    np.testing.assert_allclose(y[:, 1], np.broadcast_to(place[:, 1], (301, 3)), atol=1e-12)
+    np.testing.assert_array_equal(run.final_scene.forces[1].unbroken, [[True, False], [True, True], [False, True]])
+
+
+def test_a_cut_that_is_no_mask_of_the_springs_is_refused():
+    with pytest.raises(ValueError, match=re.escape("booleans of shape (2,)")):
+        Springs([[0, 1], [1, 2]], 1.0, 1.0).cut([1])
