@@ -37,7 +37,6 @@ class Explorer:
     def __init__(self, engine: Engine, title: str = "", summary: str = ""):
         self.engine = engine
         self.first = engine.find_start()
-        self._figures = engine.measure(self.first)
         self._title, self._summary = title, summary
 
     def __repr__(self) -> str:
@@ -95,10 +94,12 @@ class Explorer:
 
     @cached_property
     def _spec(self) -> dict[str, Any]:
-        return describe_view(self.engine, self.first, self._title, self._summary, self._figures)
+        return describe_view(self.engine, self.first, self._title, self._summary, self.engine.measure(self.first))
 
     def _write_offline_page(self) -> str:
-        return write_page(self._spec | {"note": OFFLINE_NOTE, "code": self.code()})
+        self.engine.find_limit(self.first)  # no later than here: nothing computes behind the page
+        figures = [figure._asdict() for figure in self.engine.measure(self.first)]
+        return write_page(self._spec | {"figures": figures, "note": OFFLINE_NOTE, "code": self.code()})
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
         """The widget, or without its libraries the page of the start setting below a sentence on what is missing."""
