@@ -63,7 +63,8 @@ def draw_stability_map(result: StabilityMap, figure: "Figure | None" = None) -> 
     handles = [Rectangle((0, 0), 1, 1, color=c) for c in VERDICT_COLOURS] + [
         Line2D([], [], color="black", linewidth=1.8)
     ]
-    words = (f"stable, error < {100 * INACCURATE_ERROR:g} % of the way", "inaccurate", "diverged", "predicted limit")
+    accurate = f"error < {100 * INACCURATE_ERROR:g} % of the way"
+    words = (accurate, "inaccurate", "diverged", "predicted limit of stability")
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
