@@ -87,7 +87,7 @@ def _draw_strips(ax: "Axes", result: StabilityMap) -> None:
             ax.plot([limit, limit], [place - 0.5, place + 0.5], color="black", linewidth=2.2)
         else:
             edge, side = (0.01, "left") if limit == 0 or limit < result.dts.min() else (0.99, "right")
-            text = "never stable" if limit == 0 else "limit beyond this edge"
+            text = {0.0: "never stable", np.inf: "any step is stable"}.get(float(limit), "limit beyond this edge")
             ax.text(edge, float(place), text, transform=ax.get_yaxis_transform(), ha=side, va="center", fontsize=8.5)
     ax.hlines(places[:-1] + 0.5, *ax.get_xlim(), color="white", linewidth=2)
     ax.set_yticks(places, [name.replace("_", " ") for name in result.methods])
