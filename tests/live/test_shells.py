@@ -196,3 +196,11 @@ def test_without_the_libraries_a_notebook_gets_a_sentence_and_the_page(monkeypat
     assert "<iframe srcdoc=" in shown["text/html"]
     with pytest.raises(ImportError, match="physjax\\[explore\\]"):
         _ = alone.widget
+
+
+def test_a_notebook_leaves_its_sliders_the_arrow_keys_and_its_strip_the_layout():
+    """Both seen in JupyterLab 4: it takes the keys of all that is no text field, and lets the names of lists float."""
+    from physjax.live.pages import read_live_file
+
+    assert 'querySelectorAll("input, select, button")) part.dataset.lmSuppressShortcuts' in read_live_file("live.js")
+    assert ".physjax-live .strip dt { float: none;" in read_live_file("live.css")
