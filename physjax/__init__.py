@@ -1,8 +1,64 @@
 """Game physics in JAX: describe a scene once, run it under any method, batch it, differentiate it.
 
 Nouns are records (`Particles`, `Scene`, `Trajectory`), verbs are functions (`simulate`, `sweep`, `solve`), and the modules
-are namespaces: `forces`, `contacts`, `methods`, `plot`, ... The README has the map of the package, two walks through it (dt,
-and a force's value) and a glossary.
+are namespaces: `forces`, `contacts`, `methods`, `plot`, ...
+
+# Where to find what
+
+- Describe a scene: `Particles`, `Scene`; the newtons of each of its forces at a moment: `loads`. Nodes that follow a
+  prescribed path: `Pins`.
+- Run it: `simulate`, with a method of `physjax.stepping.methods`; through diffrax: `reference`; our right-hand side under
+  diffrax's own solvers: `ode_term`.
+- Forces: `physjax.physics.forces`; velocity fields of the air: `fields`; a force of your own: subclass `Force`.
+- Contacts and friction: `physjax.physics.contacts`. Springs, ropes, cloth and jelly: `physjax.physics.springs`, `lattices`.
+- Rigid bodies in space and in the plane, their contacts and joints: `physjax.physics.rigid`, `inertia`.
+- Particles that are born and die: `physjax.physics.emitters`.
+- Read a run: `flight[-1]`, `flight.at(t)`, `flight.energy()`, `flight.to_xarray()`, and `Trajectory.crossing`: when, where and
+  how fast it first crosses a height or a surface, with derivatives.
+- Ask about it: `accuracy` (work-precision, the best method for an error, ablation), `stability` (the largest stable step, why a
+  run diverged), `energy` (where the energy went), `gradients` (how far a derivative can be trusted).
+- Ask backwards: `aim_at`, `solve`, `minimise`, `fit`. Over many parameters: `sweep`; to sweep dt: `state_after`.
+- Look at it: `plot`, `animate`, `explore`; hand it to Blender or a game engine: `export`. Closed forms: `projectile`.
+- The gallery: `scenes`. Compiled programs kept between sessions: `cache`. The command line: `physjax --help`.
+
+# Arrays and units
+
+Shapes are `(*lanes, dim)`, component last. A number of a force or contact has shape `()` or the lanes' shape, so a parameter
+sweep is an array in place of a number; a vector is `(dim,)` or `(*lanes, dim)`. Any other shape is refused when the scene is
+built. SI units, y up; with `forces.Gravity(up=2)` up is z, and aiming, heights, plots and pages follow (`scene.up`). The
+dtype is that of the state: float32 unless `jax.config.update("jax_enable_x64", True)`.
+
+Changing dt or any physical number recompiles nothing. A function that is defined again at each call does, with a warning:
+define it once, or use a module whose fields are arrays. A number out of bounds (a mass <= 0, a restitution of 1.5, a start
+below the floor) raises before anything is compiled; inside `jit`, `vmap` or a sweep it makes its own lane NaN. A run that
+diverges does not raise: `flight.ok` and `flight.first_bad_step` say which lane and when, and its neighbours are untouched.
+Under `jax.disable_jit()` a force sees numbers, so that `print` shows them.
+
+# Glossary
+
+- **lane**: one of many particles, bodies or nodes; an entry of the leading axes. **Coupled** lanes exert forces on each
+  other and share step size and status (`Scene.couples`); **held** or **pinned** ones are moved by no force (`Scene.held`).
+- **field**: a force proportional to mass, given as an acceleration (`Field`). **Potential**: the potential energy of a
+  conservative force (`Force.potential`). **Memory**: arrays besides the state that a step changes (`Scene.changing`).
+- **stage**: a named part of a step: move, resolve contacts, prescribe, advance memory (`Scene.stages`).
+- **signed distance**: distance to a surface, positive on the legal side [m]. **Contact response**: when and how contacts are
+  resolved. **Time of impact**: when, inside a step, a lane reaches a surface. **Leg**: the part of a step between contact events.
+- **restitution**: K_r, the share of the normal speed that an impact returns. **Friction**: K_f, the share of the tangential
+  velocity that an impact takes, or Coulomb's law. **Contact mode**: free, at rest, sticking or sliding.
+- **order**: the global error falls as dt to this power. **Stability limit**: the largest stable ω·dt of a method, or the
+  largest stable dt of a scene. **Evaluations**: force evaluations per step. All three are in `method.promises`.
+- **work-precision**: run time against error, one curve per method. **Reference solution**: what errors are measured against:
+  a closed form, diffrax at 1e-12, or finer steps. **Ablation**: a run with one part of the model left out.
+- **status**: whether a lane stayed finite, and the first step at which it did not (`Trajectory.ok`).
+
+# How the package is built
+
+Folders carry the names of the public namespaces, and imports point down only: `cli`, `live`, `scenes` (the gallery), `study`
+(what you ask of a scene), `show` (what you look at), then `physics` and `stepping` next to each other, then the nouns
+(`scene.py`, `trajectory.py`, `particles.py`, ...), then `kernels` and `components` (a step rewritten for a GPU), then the ground.
+Physics does not know how it is stepped; stepping does not know what acts. State and results are `NamedTuple`s; a scene, a
+force, a contact is an `equinox.Module`; everything else is a function. `backend.py` is the only place that knows what the
+compiler needs on each device. `physjax.stepping` follows dt through a step, `physjax.physics` follows the value of a force.
 
 Every name has an example that runs after these lines: a shot, its flight, an oscillator, a flag, a tumbling brick, a
 fountain.

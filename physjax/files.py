@@ -18,6 +18,8 @@ import numpy as np
 
 RUN_FORMAT = 1
 """Format version of the files that `Trajectory.save` writes; files of the first edition lack it and have this one."""
+SWEEP_FORMAT = 1
+"""Format version of the files that `Sweep.save` writes and of the folders of sweeps; those without one have this one."""
 
 Verdict = bool | np.bool | np.ndarray
 """Whether an array of a file is as it must be, or which of its entries are."""
@@ -103,8 +105,24 @@ def read_arrays(path: str | os.PathLike, writer: str) -> dict[str, np.ndarray]:
         raise ValueError(f"load: {file} is damaged or not an .npz file (it holds one array).") from error
 
 
+def demand_known_format(who: str, file: str | os.PathLike, found: object, newest: int) -> None:
+    """Raise a ValueError where a file's format version is none, or newer than what is known here: `newest`."""
+    whole = isinstance(found, int) or (isinstance(found, np.ndarray) and found.ndim == 0 and found.dtype.kind in "iu")
+    number = int(found) if whole else 0  # pyright: ignore[reportArgumentType]  # it is one of the two
+    if number < 1:
+        raise ValueError(
+            f"{who}: {file}: format: got {found}, expected a whole number from 1 on. It is damaged: save it again."
+        )
+    if number > newest:
+        raise ValueError(
+            f"{who}: {file}: format: got {number}, expected at most {newest}: a newer physjax wrote it. "
+            "Update physjax to read it."
+        )
+
+
 def demand_saved_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise a ValueError that names the file and the array that no run could have written."""
+    demand_known_format("load", file, arrays.get("format", RUN_FORMAT), RUN_FORMAT)
     needed = {"time", "ok", "first_step", "save_every", "steps", "method"}
     # a run of ours: that of a reference solver has no dt
     if any(name.startswith(("final_state.", "first_bad_step")) for name in arrays):
@@ -122,13 +140,6 @@ def demand_saved_run(file: str | os.PathLike, arrays: Mapping[str, np.ndarray]) 
             )
 
     is_count = lambda name, least: arrays[name].ndim == 0 and arrays[name].dtype.kind in "iu" and arrays[name] >= least  # noqa: E731
-    if "format" in arrays:
-        demand("format", is_count("format", 1), "a whole number from 1 on")
-        demand(
-            "format",
-            arrays["format"] <= RUN_FORMAT,
-            f"at most {RUN_FORMAT}: a newer physjax wrote it, which can load it",
-        )
     demand("save_every", is_count("save_every", 1), "a whole number from 1 on")
     demand("steps", is_count("steps", 0), "a whole number of steps")
     steps, save_every = int(arrays["steps"]), int(arrays["save_every"])

@@ -19,7 +19,8 @@ def test_chart_writes_picture_csv_and_page(tmp_path, capsys):
     assert {file.name for file in folder.iterdir()} == {"projectile.png", "projectile.csv", "index.html"}
     assert (folder / "projectile.png").stat().st_size > 20_000
     page = (folder / "index.html").read_text()
-    assert "semi_implicit_euler" in page
+    assert "semi_implicit_euler" in page.replace("<wbr>", "")
+    assert "Pareto front" in page
     assert "<img" in page
     printed = capsys.readouterr().out
     assert f"Chart: {folder / 'projectile.png'}" in printed

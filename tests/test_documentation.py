@@ -15,12 +15,22 @@ NAMESPACES = [thing for name in physjax.__all__ if isinstance(thing := getattr(p
 
 @pytest.fixture(scope="module")
 def pages():
-    """The modules that pdoc writes a page for; a name that does not resolve is a warning, and an error here."""
+    """The modules that pdoc writes a page for; a name or a type that does not resolve is a warning, and an error here."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         modules = [pdoc.doc.Module.from_name(name) for name in pdoc.extract.walk_specs(["physjax"])]
         assert all(module.docstring and module.members is not None for module in modules)
+        assert sum(len(resolve_types(module)) for module in modules) > 1000
     return modules
+
+
+def resolve_types(part):
+    """The types of all parameters and fields of a module or a class, which pdoc resolves when it is asked for them."""
+    if part.kind == "function":
+        return [parameter.annotation for parameter in part.signature.parameters.values()]
+    if part.kind == "variable":
+        return [part.annotation]
+    return [found for member in part.members.values() if member.kind != "module" for found in resolve_types(member)]
 
 
 def find_page(module, pages):

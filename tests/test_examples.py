@@ -58,6 +58,16 @@ def stock():
     plt.close("all")
 
 
+MODULES = [thing for name in physjax.__all__ if isinstance(thing := getattr(physjax, name), ModuleType)]
+
+
+@pytest.mark.parametrize(
+    "module", [m for m in MODULES if ">>>" in (m.__doc__ or "")], ids=lambda module: module.__name__
+)
+def test_the_example_of_a_module(module, stock):
+    run(module.__name__, inspect.getdoc(module), dict(stock))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_example_of(name, stock, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

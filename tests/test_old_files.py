@@ -3,6 +3,8 @@
 The files in `data` were written by version 0.1.0, in float64, before its modules and fields got other names.
 """
 
+import json
+import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -76,3 +78,46 @@ def test_an_old_sweep_loads(name):
     close(found.values["time"][2], [1.0969033711596181, 1.8207333121220155, NAN, NAN], 0.0)
     best = found.best("range", largest=True)
     assert (best.index, best.score) == ((2, 1), 22.09812119592364)
+
+
+# files of a newer version
+
+
+@pytest.mark.parametrize(("name", "load"), [("old_run.npz", Trajectory.load), ("old_sweep.npz", sweep.load)])
+@pytest.mark.parametrize(
+    ("version", "expected"),
+    [
+        (2, r"got 2, expected at most 1: a newer physjax wrote it\. Update physjax"),
+        (0, "got 0, expected a whole number"),
+    ],
+)
+def test_a_file_of_a_newer_or_of_no_format_is_refused_whatever_else_is_in_it(tmp_path, name, load, version, expected):
+    arrays = dict(np.load(DATA / name)) if version == 0 else {"a_new_array": np.ones(3)}
+    np.savez(tmp_path / name, **arrays | {"format": np.array(version)})
+    with pytest.raises(ValueError, match=rf"^load: .*{name}: format: {expected}"):
+        load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("version", "expected"), [(2, "got 2, expected at most 1"), ("new", "got new, expected a whole")]
+)
+def test_so_is_a_folder_of_a_sweep(tmp_path, version, expected):
+    folder = shutil.copytree(DATA / "old_sweep", tmp_path / "sweep")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(
+        json.dumps({"format": version} if version == 2 else {**manifest, "format": version})
+    )
+    with pytest.raises(ValueError, match=rf"^sweep: .*manifest\.json: format: {expected}"):
+        sweep.load(folder)
+
+
+def test_what_is_written_says_its_format(tmp_path):
+    found = sweep(lambda x: 2.0 * x, {"x": jnp.arange(3.0)}, out=tmp_path / "sweep", progress=False)
+    found.save(tmp_path / "sweep.npz")
+    assert json.loads((tmp_path / "sweep" / "manifest.json").read_text())["format"] == 1
+    assert np.load(tmp_path / "sweep.npz")["format"] == 1
+    assert (
+        sweep.load(tmp_path / "sweep.npz").values.tolist()
+        == sweep.load(tmp_path / "sweep").values.tolist()
+        == [0, 2, 4]
+    )

@@ -13,6 +13,15 @@ if TYPE_CHECKING:
 
 BOUNCING_SCENE = "bouncing_ball"
 """The scene that shows how contacts lower the order of a method."""
+GUIDE = (
+    "Every method runs each scene with finer and finer steps. A cell of the table names the fastest run whose error stays below "
+    "the share of the path at the head of its column: the method, its step, and how long one run takes.",
+    "Which run to take? Choose the error that you can accept (a hundredth is rarely seen in a game, 1e-4 is below a pixel) and "
+    "take what stands in that column. If several methods are about as fast, take the simplest.",
+    "In the charts of error against run time lower left is better. The band is the Pareto front: no run is both faster and more "
+    "accurate than one on it. Where errors are drawn against the step, the slope of a line is the order of its method.",
+)
+"""How the page of charts is read."""
 DEFAULT_SCENES = ("fall_with_drag", "oscillator", "kepler", BOUNCING_SCENE)
 """What is charted by default: free flight with drag, stiff and soft springs, a close approach, and contacts."""
 
@@ -76,6 +85,8 @@ def _run_chart(options: argparse.Namespace) -> int:
 def _choose_scenes(names: list[str], everything: bool) -> list[str]:
     """The scenes that were named, or those of the default; with `everything` those without contacts or memory, and a ball.
 
+    All of them come in the order of reading, the easiest first.
+
     The others are charted when they are named; all of them together would take an hour.
     """
     from physjax.checks import demand_known
@@ -85,8 +96,17 @@ def _choose_scenes(names: list[str], everything: bool) -> list[str]:
     if everything and names:
         raise ValueError(f"--all: got {names[0]} as well, expected no names with it.")
     if everything:
-        return [name for name in SCENES if name == BOUNCING_SCENE or list_scene(name).smooth]
+        smooth = [name for name in SCENES if name == BOUNCING_SCENE or list_scene(name).smooth]
+        return sorted(smooth, key=_rate_difficulty)
     return [demand_known("scene", name, SCENES) for name in dict.fromkeys(names)] or list(DEFAULT_SCENES)
+
+
+def _rate_difficulty(name: str) -> tuple[bool, bool, int]:
+    """What makes a scene harder to read: contacts, a truth that is no closed form, and many lanes."""
+    from physjax.scenes.catalogue import list_scene
+
+    entry = list_scene(name)
+    return not entry.smooth, not entry.truth.startswith("closed form"), int(entry.size.split()[0])
 
 
 def _write_page(folder: Path, summary: str, sections: "list[Section]") -> None:
@@ -95,7 +115,7 @@ def _write_page(folder: Path, summary: str, sections: "list[Section]") -> None:
     from physjax.study.report_page import build_page
 
     with write_atomically(folder / "index.html") as file:
-        file.write(build_page("physjax: speed against accuracy", summary, sections))
+        file.write(build_page("physjax: speed against accuracy", summary, sections, guide=GUIDE))
 
 
 def _write_reports(names: list[str], folder: Path) -> None:

@@ -1,5 +1,6 @@
 """`explore`: a scene with sliders, in a notebook or a browser; without what that needs, a page with the start setting."""
 
+import base64
 import os
 import threading
 import webbrowser
@@ -16,10 +17,14 @@ from physjax.live.worker import Worker
 from physjax.scenes import SCENES
 from physjax.scenes import title as scene_title
 from physjax.scenes.parameters import read_parameters
-from physjax.show.pages import check_output_path, embed_page
+from physjax.show.auto_plot import draw_still
+from physjax.show.pages import check_output_path
 from physjax.show.pages import write_page as write_file
+from physjax.show.stills import bundle_page, encode_still
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from physjax.live.widget import LiveWidget
 
 INSTALL = 'explore: sliders in a notebook need anywidget: pip install "physjax[explore]". Until then here is the start setting.'
@@ -37,7 +42,6 @@ class Explorer:
     def __init__(self, engine: Engine, title: str = "", summary: str = ""):
         self.engine = engine
         self.first = engine.find_start()
-        self._figures = engine.measure(self.first)
         self._title, self._summary = title, summary
 
     def __repr__(self) -> str:
@@ -64,6 +68,19 @@ class Explorer:
         Raises ValueError for a name that does not end in .html and FileNotFoundError where there is no such folder.
         """
         return write_file(check_output_path(path, (".html",)), self._write_offline_page())
+
+    def still(self) -> "Figure":
+        """The start setting's run as a figure of matplotlib, with the setting below it."""
+        flight, settings = self.first.run.flight, self.first.settings
+        problem = self.first.built.problem
+        figure = draw_still(flight, None if problem is None else problem.looks)
+        numbers = [
+            f"{slider.name} = {settings.numbers[slider.name]:.4g} {slider.unit}" for slider in self.engine.sliders
+        ]
+        setting = [*numbers, settings.method, f"dt = {settings.dt:.3g} s"]
+        text = ", ".join(part.strip() for part in setting)
+        figure.text(0.5, -0.02, f"{text}\nRun the cell to move the sliders.", ha="center", va="top", fontsize="small")
+        return figure
 
     def serve(self, port: int = 0, *, browser: bool = True) -> None:
         """Open the view in a browser, from a web server of this machine alone, until Ctrl-C."""
@@ -95,19 +112,24 @@ class Explorer:
 
     @cached_property
     def _spec(self) -> dict[str, Any]:
-        return describe_view(self.engine, self.first, self._title, self._summary, self._figures)
+        return describe_view(self.engine, self.first, self._title, self._summary, self.engine.measure(self.first))
 
     def _write_offline_page(self) -> str:
-        return write_page(self._spec | {"note": OFFLINE_NOTE, "code": self.code()})
+        self.engine.find_limit(self.first)  # no later than here: nothing computes behind the page
+        figures = [figure._asdict() for figure in self.engine.measure(self.first)]
+        return write_page(self._spec | {"figures": figures, "note": OFFLINE_NOTE, "code": self.code()})
 
     def _repr_mimebundle_(self, **options: Any) -> Any:
-        """The widget, or without its libraries the page of the start setting below a sentence on what is missing."""
+        """The widget and a still; without its libraries the page of the start setting, and above it what is missing."""
+        still = encode_still(self.still())
         try:
             widget = self.widget
         except ImportError:
-            page = embed_page(self._write_offline_page(), NOTEBOOK_HEIGHT_PIXELS)
-            return {"text/plain": repr(self), "text/html": f"<p>{INSTALL}</p>{page}"}
-        return widget._repr_mimebundle_(**options)
+            bundle = bundle_page(self._write_offline_page(), NOTEBOOK_HEIGHT_PIXELS, still, repr(self))
+            return bundle | {"text/html": f"<p>{INSTALL}</p>{bundle['text/html']}"}
+        shown = widget._repr_mimebundle_(**options)
+        data, metadata = shown if isinstance(shown, tuple) else (shown or {}, {})
+        return data | {"image/png": base64.b64encode(still).decode(), "text/plain": repr(self)}, metadata
 
     def _display_(self) -> Any:
         """What marimo shows."""

@@ -7,8 +7,9 @@ from importlib import resources
 from typing import Any
 
 from physjax.live.engine import Answer, Engine
+from physjax.show.page_data import pack_arrays
 from physjax.show.pages import read_web_file
-from physjax.show.view import View
+from physjax.show.view import write_player
 
 OFFLINE_NOTE = "a still setting: nothing computes behind this page"
 """Shown where the sliders of a page without an engine are."""
@@ -36,7 +37,7 @@ def describe_view(engine: Engine, answer: Answer, title: str, summary: str, figu
         "methods": list(engine.methods),
         "dt": engine.step_slider.describe(),
         "start": engine.start._asdict(),
-        "page": View(film).page(),
+        "page": write_player(pack_arrays(film)),
         "box": [film["low"], film["high"]],
         "figures": [figure._asdict() for figure in figures],
     }

@@ -1,6 +1,7 @@
 """A run drawn by what its scene holds: a surface, bodies, springs or rods between nodes, or particles with their paths."""
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -45,18 +46,32 @@ def plot_run(film: Trajectory, looks: Look | None = None) -> "Figure":
     return _DRAWERS[kind][0](film, looks, frames=-1)
 
 
-def animate_run(film: Trajectory, looks: Look | None = None) -> Film:
-    """A run as a short film; see `plot_run`."""
+def animate_run(film: Trajectory, looks: Look | None = None, *, scene: int | Sequence[int] | None = None) -> Film:
+    """A run as a short film; see `plot_run`. Of a batch of lattices `scene` picks one."""
     duration = float(np.ptp(np.asarray(film.time)))
     speed = duration / float(np.clip(duration, MIN_PLAY_SECONDS, MAX_PLAY_SECONDS))
     if _has_emitter(film):
         return animate.particles(film, fps=FPS, speed=speed)
-    kind, looks = _choose_drawable(film, looks)
+    kind, looks = _choose_drawable(film, looks, scene)
     if kind is Dots and isinstance(film.state, PlanarBodies):
         return animate.bodies(film, fps=FPS, speed=speed)
     if kind is Dots:
         return animate.paths(film, every=_lane_stride(film), trail=TRAIL_SECONDS, fps=FPS, speed=speed)
-    return _DRAWERS[kind][1](film, looks, fps=FPS, speed=speed)
+    of_batch = {} if scene is None else {"scene": scene}
+    return _DRAWERS[kind][1](film, looks, fps=FPS, speed=speed, **of_batch)
+
+
+def draw_still(film: Trajectory, looks: Look | None = None, *, scene: int | Sequence[int] | None = None) -> "Figure":
+    """A run as one picture, which pyplot does not show once more: the paths of particles, the middle of all else."""
+    from matplotlib import pyplot as plt
+
+    kind, _ = _choose_drawable(film, looks, scene)
+    if kind is Dots and not isinstance(film.state, PlanarBodies) and not _has_emitter(film):
+        figure = _draw_paths(film)
+        plt.close(figure)
+        return figure
+    drawn = animate_run(film, looks, scene=scene)
+    return drawn.still(len(drawn.frames) // 2)
 
 
 def _has_emitter(film: Trajectory) -> bool:
@@ -64,9 +79,11 @@ def _has_emitter(film: Trajectory) -> bool:
     return film.scene is not None and film.scene.emitter is not None
 
 
-def _choose_drawable(film: Trajectory, looks: Look | None) -> tuple[type, Look | None]:
+def _choose_drawable(
+    film: Trajectory, looks: Look | None, scene: int | Sequence[int] | None = None
+) -> tuple[type, Look | None]:
     looks = find_default_look(film) if looks is None else looks
-    return type(choose_drawable("plot_run", film, looks, dims=(1, 2, 3))), looks
+    return type(choose_drawable("plot_run", film, looks, scene, dims=(1, 2, 3))), looks
 
 
 def _draw_paths(film: Trajectory) -> "Figure":

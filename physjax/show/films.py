@@ -14,8 +14,9 @@ from physjax.checks import as_real_quantity
 from physjax.files import write_atomically
 from physjax.show import obstacles
 from physjax.show.frames import Frames
-from physjax.show.pages import check_output_path, embed_page, fill_page, write_page
+from physjax.show.pages import check_output_path, fill_page, write_page
 from physjax.show.panels import Scenery, arrange_panels
+from physjax.show.stills import bundle_page, embed_page, encode_still
 from physjax.text import progress_bar
 
 if TYPE_CHECKING:
@@ -99,7 +100,14 @@ class Film:
 
     def _repr_html_(self) -> str:
         page, height = self._build_player(progress=True)
-        return embed_page(page, height + TOOLBAR_PIXELS)
+        return embed_page(page, height + TOOLBAR_PIXELS, self._encode_still())
+
+    def _repr_mimebundle_(self, **options: object) -> dict[str, str]:
+        page, height = self._build_player(progress=True)
+        return bundle_page(page, height + TOOLBAR_PIXELS, self._encode_still(), repr(self))
+
+    def _encode_still(self) -> bytes:
+        return encode_still(self.still(len(self.frames) // 2))
 
     def _build_renderer(self) -> "tuple[Figure, Callable[[int], None]]":
         """A figure, and the function that shows a frame of the run in it.

@@ -1,6 +1,5 @@
 """HTML pages made from the templates that the package ships in web/: they fetch nothing, and play in any browser."""
 
-import html
 import os
 from collections.abc import Iterable
 from functools import cache
@@ -26,12 +25,6 @@ def fill_page(name: str, **parts: object) -> str:
     for part, content in parts.items():
         page = page.replace(f"__{part}__", str(content))
     return page
-
-
-def embed_page(page: str, height: int) -> str:
-    """A page inside a notebook, `height` pixels high."""
-    style = f"width:100%;height:{height}px;border:0"
-    return f'<iframe srcdoc="{html.escape(page)}" style="{style}" allowfullscreen></iframe>'
 
 
 def check_output_path(path: str | os.PathLike, endings: Iterable[str]) -> Path:

@@ -7,8 +7,8 @@ import base64
 import json
 import os
 import zlib
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,11 +18,13 @@ from physjax.show.drawables import Look
 from physjax.show.films import schedule
 from physjax.show.page_content import Pace, describe_run, take_seen
 from physjax.show.page_data import Json, pack_arrays
-from physjax.show.pages import check_output_path, embed_page, fill_page, read_web_file, write_page
+from physjax.show.pages import check_output_path, fill_page, read_web_file, write_page
 from physjax.show.panels import build_scenery
+from physjax.show.stills import bundle_page, embed_page, encode_still
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from matplotlib.typing import ColorType
 
 NOTEBOOK_HEIGHT_PIXELS = 560
@@ -37,8 +39,8 @@ class View:
         True
     """
 
-    def __init__(self, content: Json):
-        self._content = pack_arrays(content)
+    def __init__(self, content: Json, still: "Callable[[], Figure]"):
+        self._content, self._still = pack_arrays(content), still
         self.frames = tuple(content["frames"])
         self.fps = content["fps"]
 
@@ -47,10 +49,11 @@ class View:
 
     def page(self) -> str:
         """The HTML, which needs no other file."""
-        data = json.dumps(self._content, separators=(",", ":")).replace("<", "\\u003c")
-        if len(self._content["low"]) == 2:
-            return fill_page("plane.html", FILM=data)
-        return fill_page("view.html", THREE=_load_library(), FILM=data)
+        return write_player(self._content)
+
+    def still(self) -> "Figure":
+        """The middle of the run as a figure of matplotlib: what is seen where no scripts run."""
+        return self._still()
 
     def save(self, path: str | os.PathLike) -> Path:
         """Write the page, whole or not at all; returns the path.
@@ -60,7 +63,10 @@ class View:
         return write_page(check_output_path(path, (".html",)), self.page())
 
     def _repr_html_(self) -> str:
-        return embed_page(self.page(), NOTEBOOK_HEIGHT_PIXELS)
+        return embed_page(self.page(), NOTEBOOK_HEIGHT_PIXELS, encode_still(self.still()))
+
+    def _repr_mimebundle_(self, **options: object) -> dict[str, str]:
+        return bundle_page(self.page(), NOTEBOOK_HEIGHT_PIXELS, encode_still(self.still()), repr(self))
 
 
 def view(
@@ -92,7 +98,22 @@ def view(
     seen = take_seen(who, film, shown, scene, color)
     frames, fps = schedule(who, seen.run, fps, speed)
     pace = Pace(frames, fps, float(speed))
-    return View(describe_run(who, seen, pace, build_scenery(seen.run, frames), color))
+    content = describe_run(who, seen, pace, build_scenery(seen.run, frames), color)
+    return View(content, partial(_draw_still, film, shown, scene))
+
+
+def _draw_still(film: Trajectory, shown: Look | None, scene: int | Sequence[int] | None) -> "Figure":
+    from physjax.show.auto_plot import draw_still  # above this, since it draws films
+
+    return draw_still(film, shown, scene=scene)
+
+
+def write_player(content: Json) -> str:
+    """The HTML that plays a run; the arrays of its content are packed."""
+    data = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+    if len(content["low"]) == 2:
+        return fill_page("plane.html", FILM=data)
+    return fill_page("view.html", THREE=_load_library(), FILM=data)
 
 
 @cache

@@ -17,7 +17,7 @@ from physjax.scene import Scene
 from physjax.stepping.blocks import Blocks
 
 if TYPE_CHECKING:
-    from physjax.kernels import LaneKernel, Layout
+    import physjax.kernels
 
 
 class Moving(NamedTuple):
@@ -123,8 +123,8 @@ class BlockedSteps(NamedTuple):
 class KernelSteps(NamedTuple):
     """All steps of a frame in one kernel; what is carried are columns, an array of all lanes for each number of one."""
 
-    kernel: "LaneKernel"
-    kept: "Layout"
+    kernel: "physjax.kernels.LaneKernel"
+    kept: "physjax.kernels.Layout"
 
     def start(self, moving: Moving) -> list[Array]:
         """Columns."""

@@ -21,23 +21,6 @@ from physjax.stepping.system import System, has_no_lanes, leaf_dtype, linearise_
 from physjax.vectors import scale
 
 
-class Linearised(NamedTuple):
-    """The equation of a stage linearised at a state: (1 - h K J) u = b, J the derivative of the rate.
-
-    `push` applies J to a change of the state, `move` gives the change of the end that belongs to u.
-    """
-
-    stage: "Stage"
-    b: Vector
-    push: Callable[[PyTree], PyTree]
-    move: Callable[[Vector], PyTree]
-    dissipative_symmetric: bool
-
-    def matvec(self, u: Vector) -> Vector:
-        """(1 - h K J) u."""
-        return subtract(u, self.stage.kick(self.push(self.move(self.stage.mask_held(u)))))
-
-
 class Stage(NamedTuple):
     """A stage to be solved: the system, the time of its force [s], the base that it starts from, and its step h [s].
 
@@ -60,7 +43,7 @@ class Stage(NamedTuple):
         """Whether each lane is a system of its own."""
         return not read_traits(self.system).couples or has_no_lanes(self.base)
 
-    def linearise(self) -> Linearised:
+    def linearise(self) -> "Linearised":
         """The equation linearised at `near`."""
         system = linearise_at(self.system, self.time, self.near)
         rate, push = jax.linearize(lambda y: system.rate(self.time, y), self.near)
@@ -113,6 +96,23 @@ class Stage(NamedTuple):
     def _sum(self, a: Vector, b: Vector) -> jax.Array:
         kept = len(read_traits(self.system).status_shape)
         return reduce(jnp.add, [_sum_trailing_axes(p * q, kept) for p, q in zip(a, b, strict=True)])
+
+
+class Linearised(NamedTuple):
+    """The equation of a stage linearised at a state: (1 - h K J) u = b, J the derivative of the rate.
+
+    `push` applies J to a change of the state, `move` gives the change of the end that belongs to u.
+    """
+
+    stage: Stage
+    b: Vector
+    push: Callable[[PyTree], PyTree]
+    move: Callable[[Vector], PyTree]
+    dissipative_symmetric: bool
+
+    def matvec(self, u: Vector) -> Vector:
+        """(1 - h K J) u."""
+        return subtract(u, self.stage.kick(self.push(self.move(self.stage.mask_held(u)))))
 
 
 def build_stage(system: System, time: Time, base: PyTree, h: ArrayLike) -> Stage:

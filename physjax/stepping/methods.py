@@ -3,6 +3,22 @@
 A `system` (every `Scene` is one) offers `rate(t, state)`, the whole right-hand side, and the split form `kick(state,
 rate, dt)` and `drift(state, dt)`. Methods know no physics: any force works under any of them. `t` and `dt` are scalars
 or have the shape of the lanes.
+
+`adaptive(method, atol, rtol)` lets any method choose its own steps, lane by lane; `time_scaled(leapfrog)` makes steps
+short where bodies are close and keeps the energy bounded. How large a step of yours may be, and what sets that limit,
+is for `stability.limit` to say before the run. `METHODS` and `SPECIAL_METHODS` are what charts, tests, tables and the
+command line go through: a method of your own is in all of them once `@methods.promises(order=2, evaluations=2,
+stability_limit=0.0)` stands above it.
+
+Example:
+    >>> def trapezoid(system, t, state, dt):
+    ...     along = lambda slope, dt: jax.tree.map(lambda y, k: y + dt * k, state, slope)
+    ...     here = system.rate(t, state)
+    ...     there = system.rate(t + dt, along(here, dt))
+    ...     return along(jax.tree.map(lambda a, b: (a + b) / 2, here, there), dt)
+    >>> end = simulate(swing, trapezoid, dt=0.01, steps=100).position[-1, 0]
+    >>> round(float(end), 3), round(float(np.cos(2.0)), 3)
+    (-0.416, -0.416)
 """
 
 import math

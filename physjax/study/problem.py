@@ -19,7 +19,7 @@ from physjax.study.energy.quantities import Conserved
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from physjax.show.drawables import Look  # with what draws it, which a run does without
+    import physjax.show.drawables  # with what draws it, which a run does without
 
 REFERENCE_STEPS_PER_FRAME = 64
 """Steps of rk4 between two moments at which errors are measured, where diffrax cannot be the reference."""
@@ -57,7 +57,7 @@ class Problem(NamedTuple):
     conserved: tuple[Conserved, ...] = ()
     truths: tuple[Truth, ...] = ()
     frames: int = 32
-    looks: "Look | None" = None
+    looks: "physjax.show.drawables.Look | None" = None
     name: str = ""
 
     @property

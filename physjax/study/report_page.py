@@ -1,8 +1,9 @@
-"""Results as text: tidy tables for a terminal, and one self-contained HTML page."""
+"""Results as one self-contained HTML page, whose tables and pictures fit a phone."""
 
 import base64
 import html
 import io
+import re
 from collections.abc import Sequence
 from datetime import date
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,6 +17,8 @@ PHONE_WIDTH_INCHES, READABLE_PIXELS_PER_INCH = 6.5, 65
 """Width [inch] of a figure that still fits a phone; pixels an inch at which the letters of a wider one are legible."""
 PIXELS_PER_INCH = 110
 """Of encoded figures."""
+LONG_CELL = 20
+"""A table with a cell of more letters than this is a list on a phone: its columns would not fit."""
 
 
 class Picture(NamedTuple):
@@ -28,7 +31,7 @@ class Picture(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Text whose columns are aligned."""
+    """Text whose columns are aligned, as `format_table` does it: below the headers a line of dashes."""
 
     text: str
 
@@ -41,7 +44,7 @@ class Section:
 
 
 def encode_figure(figure: "Figure", alt: str) -> Picture:
-    """A matplotlib figure as a picture; the figure is closed. On a phone a wide one scrolls, so that it stays legible."""
+    """A matplotlib figure as a picture; the figure is closed. A wide one is whole on a phone, and is enlarged by a tap."""
     from matplotlib import pyplot as plt
 
     file = io.BytesIO()
@@ -51,10 +54,11 @@ def encode_figure(figure: "Figure", alt: str) -> Picture:
     return Picture(file.getvalue(), alt, round(READABLE_PIXELS_PER_INCH * inches) if inches > PHONE_WIDTH_INCHES else 0)
 
 
-def build_page(title: str, summary: str, sections: Sequence[Section]) -> str:
-    """A self-contained HTML page, pictures inside, readable on a phone."""
+def build_page(title: str, summary: str, sections: Sequence[Section], *, guide: Sequence[str] = ()) -> str:
+    """A self-contained HTML page, pictures inside, readable on a phone. The sentences of `guide` say how to read it."""
     parts = [
         f"<h1>{html.escape(title)}</h1>",
+        *(_render_block(sentence) for sentence in guide),
         _render_block(Table(summary)) if summary else "",
         _render_contents(sections),
     ]
@@ -70,10 +74,43 @@ def build_page(title: str, summary: str, sections: Sequence[Section]) -> str:
 def _render_block(block: str | Picture | Table) -> str:
     if isinstance(block, Picture):
         source = f"data:image/{block.kind};base64,{base64.b64encode(block.data).decode()}"
-        style = f' style="min-width: {block.width}px"' if block.width else ""
-        return f'<div class="wide"><img alt="{html.escape(block.alt)}" src="{source}"{style}></div>'
-    tag, text = ("pre", block.text) if isinstance(block, Table) else ("p", block)
-    return f"<{tag}>{html.escape(text)}</{tag}>"
+        picture = f'<img alt="{html.escape(block.alt)}" src="{source}"'
+        if not block.width:
+            return f"{picture}>"
+        box = f'<input type="checkbox" aria-label="enlarge: {html.escape(block.alt)}">'
+        return f'<label class="wide">{box}{picture} style="--width: {block.width}px"></label>'
+    return _render_table(block.text) if isinstance(block, Table) else f"<p>{html.escape(block)}</p>"
+
+
+def _render_table(text: str) -> str:
+    """Aligned text as a table; what is around it, or has no line of dashes, as it stands."""
+    lines = text.splitlines()
+    ruled = next((i for i, line in enumerate(lines) if i and re.fullmatch(r"-+(  -+)*", line)), None)
+    if ruled is None:
+        return f"<pre>{html.escape(text)}</pre>"
+    columns = [slice(*dashes.span()) for dashes in re.finditer("-+", lines[ruled])]
+    columns[-1] = slice(columns[-1].start, None)
+    end = next((i for i in range(ruled, len(lines)) if not lines[i].strip()), len(lines))
+    cells = [[line[column] for column in columns] for line in [lines[ruled - 1], *lines[ruled + 1 : end]]]
+    headers = [cell.strip() for cell in cells[0]]
+    right = [any(row[i][:1] == " " for row in cells) for i in range(len(columns))]
+    long = max(len(cell.strip()) for row in cells[1:] for cell in row) > LONG_CELL if cells[1:] else False
+    rows = [_render_row("th", cells[0], headers, right), *(_render_row("td", row, headers, right) for row in cells[1:])]
+    table = f'<table class="{"list" if long else "grid"}">{"".join(rows)}</table>'
+    around = ["\n".join(part).strip("\n") for part in (lines[: ruled - 1], lines[end:])]
+    before, after = (f"<pre>{html.escape(part)}</pre>" if part else "" for part in around)
+    return f'{before}<div class="table">{table}</div>{after}'
+
+
+def _render_row(tag: str, cells: Sequence[str], headers: Sequence[str], right: Sequence[bool]) -> str:
+    """A row; each cell bears its header, which a phone shows in front of it."""
+    parts = []
+    for cell, header, number in zip(cells, headers, right, strict=True):
+        # names may be broken after an underscore
+        words = html.escape(cell.strip()).replace("_", "_<wbr>")
+        kind = ' class="number"' if number else ""
+        parts.append(f'<{tag}{kind} data-header="{html.escape(header)}">{words}</{tag}>')
+    return f"<tr>{''.join(parts)}</tr>"
 
 
 def _make_anchor(section: Section) -> str:
@@ -93,10 +130,29 @@ _PAGE = """<!doctype html>
 <style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }}
 body {{ color: #222; background: #fff; }}
-.wide {{ overflow-x: auto; }}
+.wide {{ display: block; overflow-x: auto; position: relative; }}
+.wide input {{ position: absolute; left: 0; top: 0; opacity: 0; }}
+.wide input:focus-visible + img {{ outline: 2px solid #0072B2; }}
 img {{ display: block; max-width: 100%; height: auto; }}
-pre {{ overflow-x: auto; background: #f6f6f6; padding: 1em; font-size: 13px; line-height: 1.4; }}
+pre {{ overflow-x: auto; background: #f6f6f6; padding: 1em; font-size: 13px; line-height: 1.4; white-space: pre-wrap; }}
+.table {{ overflow-x: auto; }}
+table {{ border-collapse: collapse; font-size: 14px; margin: 1em 0; }}
+th, td {{ padding: 4px 12px 4px 0; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top; }}
+.number {{ text-align: right; font-variant-numeric: tabular-nums; }}
 footer {{ color: #666; margin: 3em 0; }}
+@media (max-width: 745px) {{
+  .wide img {{ cursor: zoom-in; }}
+  .wide input:checked + img {{ max-width: none; width: var(--width); cursor: zoom-out; }}
+  table {{ width: 100%; }}
+  .wide::after {{ content: "tap to enlarge"; color: #666; font-size: 12px; }}
+  .grid {{ font-size: 11px; line-height: 1.3; }}
+  .grid th, .grid td {{ padding: 4px 3px 4px 0; }}
+  .grid td.number {{ white-space: nowrap; }}
+  .list tr:first-child {{ display: none; }}
+  .list tr, .list td {{ display: block; border: 0; padding: 0; text-align: left; }}
+  .list tr {{ border-bottom: 1px solid #ddd; padding: 6px 0; }}
+  .list td::before {{ content: attr(data-header) ": "; color: #666; }}
+}}
 </style>
 {body}
 </html>

@@ -147,11 +147,12 @@ def _chart_stability(studied: SceneStudy) -> Iterator[Block]:
         yield "No map: no method has a limit here."
         return
     yield (
-        f"Runs from the start{', without their contacts' if timed else ''}, judged by their error; the black line is the "
-        "limit predicted at their start."
+        f"Runs from the start{', without their contacts' if timed else ''}, coloured by their error; the black line is the "
+        "limit of stability predicted at their start. Beyond it a run diverges sooner or later. A method for which any "
+        "step is stable has no line and does not diverge, and is inaccurate all the same where its steps are long."
     )
     yield encode_figure(
-        chart.plot(), f"Map of the steps at which each method is stable, inaccurate or diverged in {studied.name}."
+        chart.plot(), f"Map of the steps at which each method is accurate, inaccurate or diverged in {studied.name}."
     )
 
 

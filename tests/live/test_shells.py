@@ -1,5 +1,6 @@
 """Around the engine: the worker drops what is overtaken, messages arrive whole, and pages hold what they must and no more."""
 
+import base64
 import http.client
 import json
 import re
@@ -180,7 +181,9 @@ def test_a_widget_hands_requests_on_and_messages_back(explorer):
     film, buffers = sent[0]
     assert film["kind"] == "film"
     assert len(buffers[film["film"]["part"]["places"]["array"]]) == 97 * 2 * 2
-    assert "application/vnd.jupyter.widget-view+json" in str(explorer._repr_mimebundle_())
+    bundle, _ = explorer._repr_mimebundle_()
+    assert "application/vnd.jupyter.widget-view+json" in bundle
+    assert len(base64.b64decode(bundle["image/png"])) > 4000, "what is seen of a saved notebook"
 
 
 def test_without_the_libraries_a_notebook_gets_a_sentence_and_the_page(monkeypatch):
@@ -189,6 +192,15 @@ def test_without_the_libraries_a_notebook_gets_a_sentence_and_the_page(monkeypat
     alone = explore(throw, speed=(10, 50), duration=1.0, methods=[methods.verlet], frames=4)
     shown = alone._repr_mimebundle_()
     assert 'pip install "physjax[explore]"' in shown["text/html"]
+    assert '<img src="data:image/png' in shown["text/html"]
     assert "<iframe srcdoc=" in shown["text/html"]
     with pytest.raises(ImportError, match="physjax\\[explore\\]"):
         _ = alone.widget
+
+
+def test_a_notebook_leaves_its_sliders_the_arrow_keys_and_its_strip_the_layout():
+    """Both seen in JupyterLab 4: it takes the keys of all that is no text field, and lets the names of lists float."""
+    from physjax.live.pages import read_live_file
+
+    assert 'querySelectorAll("input, select, button")) part.dataset.lmSuppressShortcuts' in read_live_file("live.js")
+    assert ".physjax-live .strip dt { float: none;" in read_live_file("live.css")

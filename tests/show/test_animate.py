@@ -1,5 +1,9 @@
 """Films play in real time, stay still where nothing moves, end where a run ends, and are whole files."""
 
+import base64
+import html
+import io
+import re
 import subprocess
 import sys
 from itertools import pairwise
@@ -106,6 +110,20 @@ def test_a_notebook_shows_it_once(swarm):
     shown = film._repr_html_()
     assert shown.count("data:image/webp;base64,") == len(film.frames) == 5
     assert "film of 5 pictures" in repr(film).lower()
+    assert not plt.get_fignums()
+
+
+@pytest.mark.parametrize("show", [animate.paths, animate.view])
+def test_a_notebook_without_scripts_shows_a_still_of_it(swarm, show):
+    shown = show(swarm, fps=4)._repr_mimebundle_()
+    seen = re.sub("<iframe.*</iframe>", "", shown["text/html"])  # what is left where a notebook is not trusted
+    (source,) = re.findall(r'<img src="data:image/png;base64,([^"]*)"', seen)
+    assert source == shown["image/png"]
+    still = Image.open(io.BytesIO(base64.b64decode(source))).convert("RGB")
+    assert still.width > 300
+    assert len(still.getcolors(10_000)) > 10
+    assert len(source) < 60_000
+    assert "<noscript><style>" in html.unescape(shown["text/html"])  # the page on top is then not seen
     assert not plt.get_fignums()
 
 

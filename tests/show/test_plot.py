@@ -1,6 +1,7 @@
 """Pictures have axes with units, the data that was given, and the same style for the same method."""
 
 import math
+import re
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -142,10 +143,32 @@ def test_page_is_self_contained():
                 "kepler", "two bodies", report_page.Picture(b"png", "an orbit"), report_page.Table("a table")
             )
         ],
+        guide=["how to <read> it"],
     )
+    assert "how to &lt;read&gt; it" in page
     assert "a &lt; b" in page
     assert "data:image/png;base64," in page
     assert "src=" in page
     assert 'alt="an orbit"' in page
     assert "http" not in page.replace("http-equiv", "")
     assert "jax " in page
+
+
+def test_aligned_text_is_a_table_on_a_page_and_what_is_around_it_stays_text():
+    rows = [["semi_implicit_euler", "1", "-"], ["rk4", "4", "3 <s>"]]
+    text = "above\n\n" + format_table(["method", "order", "to 1e-2"], rows) + "\n\nbelow"
+    page = report_page.build_page("t", "", [report_page.Section("s", report_page.Table(text))])
+    assert re.findall(r"<th[^>]*>(.*?)</th>", page) == ["method", "order", "to 1e-2"]
+    assert re.findall(r"<td[^>]*>(.*?)</td>", page) == [
+        "semi_<wbr>implicit_<wbr>euler",
+        "1",
+        "-",
+        "rk4",
+        "4",
+        "3 &lt;s&gt;",
+    ]
+    assert re.findall(r'<td class="number" data-header="(.*?)">', page) == ["order", "to 1e-2"] * 2
+    assert re.findall(r"<pre>(.*?)</pre>", page) == ["above", "below"]
+    assert '<table class="grid">' in page
+    wide = report_page.Table(format_table(["scene", "error"], [["kepler", "blanes_moan4, dt 24.5 ms: 157 µs"]]))
+    assert '<table class="list">' in report_page.build_page("t", "", [report_page.Section("s", wide)])

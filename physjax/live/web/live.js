@@ -161,6 +161,8 @@ export function mount(root, spec, channel) {
     event.preventDefault(); event.stopPropagation();
     post({ press: " " });
   });
+  // JupyterLab takes the arrow keys of whatever is no text field, unless it says so itself
+  for (const part of root.querySelectorAll("input, select, button")) part.dataset.lmSuppressShortcuts = "true";
   return () => removeEventListener("message", heard);
 }
 

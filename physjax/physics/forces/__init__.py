@@ -8,6 +8,26 @@ A force of your own needs nothing here: any subclass of `Force` (or any function
 and ablated there. To add one to this package, write the class in the file of its kind and its name into that file's
 `__all__`; this face exports what those lists hold, so no other file changes. Its numbers are fields made with `quantity`.
 A new kind of force is a new file and two lines here.
+
+Numbers declared with `quantity` are checked and may have one entry per lane; an array that is not declared is shared by
+all lanes. A `potential` puts the force into the energy audit.
+
+Example:
+    >>> class HardSpring(Force):  # to the origin: F = -(k + c r²) r
+    ...     stiffness: jax.Array = quantity("stiffness k", "N/m", at_least=0)
+    ...     hardening: jax.Array = quantity("hardening c", "N/m³", default=0.0)
+    ...
+    ...     def __call__(self, t, state, mass):
+    ...         r2 = jnp.sum(state.position**2, axis=-1, keepdims=True)
+    ...         return -(self.stiffness + self.hardening * r2) * state.position
+    ...
+    ...     def potential(self, t, state, mass):
+    ...         r2 = jnp.sum(state.position**2, axis=-1)
+    ...         return self.stiffness * r2 / 2 + self.hardening * r2**2 / 4
+    >>> start = Particles(jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]))
+    >>> duffing = Scene(start, mass=2.0, forces=(HardSpring(4.0, 1.0),))
+    >>> print(stability.limit(duffing, methods.verlet))
+    verlet: 1.07 s, set by the stiffness of HardSpring, λ = ±1.871i 1/s
 """
 
 from physjax.physics.forces import air, gravitation, laws, tabulated_drag, time_dependent, weight

@@ -52,7 +52,7 @@ class Options(NamedTuple):
 
     conserved: Sequence[Conserved] = ()
     norms: Sequence[ErrorMeasure | Callable] = ()
-    rivals: "Sequence[diffrax.AbstractERK] | None" = None
+    rivals: Sequence["diffrax.AbstractERK"] | None = None
     tolerances: Sequence[float] = TOLERANCES
     dtype: DTypeLike | list[DTypeLike] | tuple[DTypeLike, ...] = np.float64
     batch: int = 1

@@ -63,7 +63,8 @@ def draw_stability_map(result: StabilityMap, figure: "Figure | None" = None) -> 
     handles = [Rectangle((0, 0), 1, 1, color=c) for c in VERDICT_COLOURS] + [
         Line2D([], [], color="black", linewidth=1.8)
     ]
-    words = (f"stable, error < {100 * INACCURATE_ERROR:g} % of the way", "inaccurate", "diverged", "predicted limit")
+    accurate = f"error < {100 * INACCURATE_ERROR:g} % of the way"
+    words = (accurate, "inaccurate", "diverged", "predicted limit of stability")
     figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
@@ -86,7 +87,7 @@ def _draw_strips(ax: "Axes", result: StabilityMap) -> None:
             ax.plot([limit, limit], [place - 0.5, place + 0.5], color="black", linewidth=2.2)
         else:
             edge, side = (0.01, "left") if limit == 0 or limit < result.dts.min() else (0.99, "right")
-            text = "never stable" if limit == 0 else "limit beyond this edge"
+            text = {0.0: "never stable", np.inf: "any step is stable"}.get(float(limit), "limit beyond this edge")
             ax.text(edge, float(place), text, transform=ax.get_yaxis_transform(), ha=side, va="center", fontsize=8.5)
     ax.hlines(places[:-1] + 0.5, *ax.get_xlim(), color="white", linewidth=2)
     ax.set_yticks(places, [name.replace("_", " ") for name in result.methods])

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from physjax.files import read_arrays, write_atomically
+from physjax.files import SWEEP_FORMAT, demand_known_format, read_arrays, write_atomically
 from physjax.study.sweeps import store as chunks
 from physjax.study.sweeps.design import DESIGNS, Axis, Lanes, leaf_name
 from physjax.summaries import Row, format_array, format_tree, write_summary, write_table
@@ -194,14 +194,14 @@ class Sweep:
     def save(self, path: str | os.PathLike) -> None:
         """Write what `to_numpy` gives as one compressed `.npz`, readable by `numpy.load`; the file is whole or absent."""
         with write_atomically(path, "wb") as file:
-            arrays = {**self.to_numpy(), "design": np.array(self.lanes.design)}
+            arrays = {**self.to_numpy(), "design": np.array(self.lanes.design), "format": np.array(SWEEP_FORMAT)}
             np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]  # NumPy's stubs take every keyword for allow_pickle
 
 
 def load(path: str | os.PathLike) -> Sweep:
     """A sweep from a file that `Sweep.save` wrote, or from the folder of a sweep, finished or not.
 
-    Raises FileNotFoundError, or ValueError for what is neither, or damaged.
+    Raises FileNotFoundError, or ValueError for what is neither, or damaged, or written in a newer format.
     """
     path = Path(path)
     if path.is_dir():
@@ -211,6 +211,7 @@ def load(path: str | os.PathLike) -> Sweep:
             raise ValueError(f"load: {path / 'axes.npz'} does not hold the axes of this sweep. Use another folder.")
         return Sweep(lanes, tuple(folder.manifest["reasons"]), folder.gather)
     arrays = read_arrays(path, _EXPECTED_SOURCE)
+    demand_known_format("load", path, arrays.get("format", SWEEP_FORMAT), SWEEP_FORMAT)
     missing = {"status", "reasons", "design"} - set(arrays)
     if missing:
         raise ValueError(f"load: {path} is not a saved sweep: it lacks {', '.join(sorted(missing))}.")

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from physjax.backend import device_kind
-from physjax.files import ensure_writable_folder, write_atomically
+from physjax.files import SWEEP_FORMAT, demand_known_format, ensure_writable_folder, write_atomically
 
 CHUNK_FILE_PATTERN = re.compile(r"chunk-(\d{8})-([0-9a-f]{64})\.npz")
 PARTIAL_FILE_PATTERN = re.compile(r"\.chunk-(\d{8})-.*")
@@ -244,10 +244,15 @@ def found(path: str | os.PathLike) -> FolderStore:
     """A folder that a sweep has written into."""
     try:
         manifest = json.loads((Path(path) / MANIFEST).read_text(encoding="utf-8"))
-        if hash_manifest(manifest["sweep"]) != manifest["identity"]:
-            raise ValueError("it was changed")
     except FileNotFoundError as error:
         raise FileNotFoundError(f"sweep: there is no sweep in {path}: it has no {MANIFEST}.") from error
+    except ValueError as error:
+        raise ValueError(f"sweep: {Path(path) / MANIFEST} is damaged ({error}). Use another folder.") from error
+    if isinstance(manifest, dict):  # the format first: in a newer one nothing else need be as here
+        demand_known_format("sweep", Path(path) / MANIFEST, manifest.get("format", SWEEP_FORMAT), SWEEP_FORMAT)
+    try:
+        if hash_manifest(manifest["sweep"]) != manifest["identity"]:
+            raise ValueError("it was changed")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"sweep: {Path(path) / MANIFEST} is damaged ({error}). Use another folder.") from error
     return FolderStore(Path(path), manifest["sweep"])
@@ -283,7 +288,7 @@ def _read_or_write_manifest(path: Path, manifest: Manifest, axes: Mapping[str, n
     with write_atomically(path / "axes.npz", "wb", durable=True) as file:
         np.savez(file, **axes)  # pyright: ignore[reportArgumentType]  # NumPy's stubs take every keyword for allow_pickle
     with write_atomically(path / MANIFEST, durable=True) as file:
-        json.dump({"identity": hash_manifest(manifest), "sweep": manifest}, file, indent=1)
+        json.dump({"format": SWEEP_FORMAT, "identity": hash_manifest(manifest), "sweep": manifest}, file, indent=1)
     return manifest
 
 

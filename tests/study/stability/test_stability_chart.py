@@ -37,6 +37,17 @@ def test_the_region_is_drawn_with_its_axes():
     assert "rk4" in ax.get_title()
 
 
+def test_the_map_says_of_a_method_without_a_limit_what_the_limit_says():
+    limits = np.array([[0.0], [np.inf], [5.0]])
+    dts = np.broadcast_to([0.1, 0.2], (3, 1, 2))
+    names = ("euler", "implicit_euler", "rk4")
+    drawn = stability.StabilityMap(
+        names, "", np.zeros(1), dts, np.ones((3, 1, 2), int), np.ones((3, 1, 2)), limits, 1.0
+    )
+    texts = [text.get_text() for text in drawn.plot().axes[0].texts]
+    assert texts == ["never stable", "any step is stable", "limit beyond this edge"]
+
+
 def test_a_map_needs_a_function_for_a_parameter():
     with pytest.raises(TypeError, match="Give a Scene, or a function"):
         stability.map(spring(1.0), [methods.rk4], [0.1], ("stiffness", [1.0]))
