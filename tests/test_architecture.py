@@ -56,7 +56,7 @@ FLOORS = (
     {"parts"},
     {"pins", "stages", "trials"},
     {"scene"},
-    {"memories"},
+    {"memories", "first_order"},
     {"constraints", "select", "crossing", "moments", "run_files"},
     {"trajectory"},
     {"physics", "stepping"},
