@@ -38,6 +38,7 @@ FLOORS = (
         "old_names",
         "components",
         "programs",
+        "custom_transpose",
     },
     {
         "roots",

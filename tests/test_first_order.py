@@ -89,7 +89,7 @@ def test_gradients_by_starts_parameters_and_tables_are_those_of_differences():
         )
 
     at = jnp.asarray(STARTS), jnp.asarray(RHO)
-    check_grads(end, at, order=1, modes=("rev",), eps=1e-6)
+    check_grads(end, at, order=1, modes=("fwd", "rev"), eps=1e-6)
 
     def turned(matrix):
         return simulate(ode_scene(Rotation(matrix), jnp.ones((4, 2))), methods.rk4, dt=0.1, steps=3).state.y[-1, 0, 0]
