@@ -20,8 +20,6 @@ LIMIT = 0.01
 """Relative errors beyond which an answer is of no use."""
 DIRECTIONS, DIFFERENCE = 3, 1e-5
 """Directions along which derivatives are compared, and the share of θ's scale that differences step by."""
-CLAIM = 3.0
-"""How many times as fast physjax is meant to be as any peer."""
 
 
 class Size(NamedTuple):
@@ -108,7 +106,7 @@ def compare_gradient(work: Workload, size: Size, gradient: np.ndarray, differenc
     return float(np.abs(found - differences).max() / np.abs(differences).max())
 
 
-def compare_places(work: Workload, places: np.ndarray, truth: np.ndarray) -> float:
+def compare_places(places: np.ndarray, truth: np.ndarray) -> float:
     """The largest distance from the truth, in the unit of the places."""
     return float(np.abs(places - truth).max())
 
@@ -182,7 +180,7 @@ def _measure_once(work: Workload, peer: Peer, size: Size, exact: np.ndarray, slo
             gradient = compare_gradient(work, size, as_numbers(jax.block_until_ready(run.gradient())), slopes)
         except Exception as error:  # what cannot be differentiated still runs, and its row says why
             gradient = f"{type(error).__name__}: {str(error)[:200]}"
-    return compare_places(work, places, exact), gradient
+    return compare_places(places, exact), gradient
 
 
 def measure_costs(work: Workload, peers: Iterable[Peer], sizes: Iterable[Size], repeats: int) -> list[dict[str, Any]]:

@@ -93,6 +93,11 @@ def test_a_finished_workload_is_this_machines_and_has_the_peers_that_are_asked_f
     assert suite.find_finished(path, peers=True) is None
 
 
+def test_no_workload_has_the_name_of_a_study_whose_results_it_would_overwrite(load):
+    studies = {file.stem for file in (ROOT / "benchmarks").glob("*.py")}
+    assert not studies & {*load("suite").WORKLOADS}
+
+
 def test_the_adapter_has_the_derivatives_of_differences(load):
     adapter = load("adapter")
     velocity, area = np.array([[30.0, 20.0], [10.0, 5.0]]), np.array(4.3e-3)

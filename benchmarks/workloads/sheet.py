@@ -19,7 +19,7 @@ F, FINE = np.float32, 16
 
 
 def _load_study():
-    """The study of the same name, which has the case."""
+    """The study of this cloth, which has the case."""
     spec = importlib.util.spec_from_file_location("cloth_study", Path(__file__).parents[1] / "cloth.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -174,7 +174,7 @@ def list_peers() -> Iterator[Peer]:
 
 
 WORK = Workload(
-    name="cloth",
+    name="sheet",
     about="NVIDIA's cloth case: springs with damping, two corners pinned, 960 steps a second of semi-implicit Euler, float32; "
     "gradient by the velocities of all nodes.",
     exact="the same step in float64, sixteen for one",
