@@ -141,7 +141,7 @@ def measure_errors(work: Workload, peers: Iterable[Peer], horizons: Iterable[int
 
 def _measure_peer(work: Workload, peer: Peer, horizons: list[int], exact: Mapping, slopes: Mapping) -> list[dict]:
     checked, rows, errors = work.checked, [], {}
-    for steps in sorted({checked.steps, *horizons}):
+    for steps in dict.fromkeys((checked.steps, *horizons)):
         size = Size(checked.lanes, steps)
         try:
             errors[steps] = _measure_once(work, peer, size, exact[steps], slopes[steps])
@@ -149,7 +149,7 @@ def _measure_peer(work: Workload, peer: Peer, horizons: list[int], exact: Mappin
             if steps == checked.steps:
                 why = f"{type(error).__name__}: {str(error)[:200]}"
                 return [make_row("runs", peer, size, ok=False, why=why, how=peer.how)]
-            break
+            errors[steps] = np.inf, None  # it does not hold so far
     places, gradient = errors[checked.steps]
     differentiates = isinstance(gradient, float)
     why = gradient if isinstance(gradient, str) else None

@@ -116,7 +116,7 @@ def with_pymunk(size: Size) -> Run:
             for s in range((SETTLING + size.steps) * SUBSTEPS):
                 if s == SETTLING * SUBSTEPS:
                     for box in boxes:
-                        box.velocity = (*box.velocity, float(speed), 0)
+                        box.velocity = box.velocity.x + float(speed), box.velocity.y
                 space.step(DT / SUBSTEPS)
             ends.append([tuple(box.position) for box in boxes])
         return np.array(ends)
