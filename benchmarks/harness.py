@@ -50,6 +50,8 @@ PACKAGES = (
     "taichi",
     "mujoco-mjx",
     "rebound",
+    "pymunk",
+    "scipy",
 )
 TURN_SECONDS = 0.5
 """Seconds of a turn."""
@@ -204,9 +206,7 @@ def parse_options(about: str | None) -> tuple[bool, Path]:
 def build_parser(about: str | None) -> argparse.ArgumentParser:
     """The options that every benchmark has."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--quick", action="store_true", help="small sizes: shows that everything runs, measures nothing"
-    )
+    parser.add_argument("--quick", action="store_true", help="small sizes: shows that everything runs, and little else")
     parser.add_argument("--out", type=Path, default=RESULTS, metavar="DIR", help="where results go (%(default)s)")
     return parser
 

@@ -103,6 +103,7 @@ from physjax.trajectory import Trajectory
 if TYPE_CHECKING:
     from physjax import projectile, scenes, show, study
     from physjax.constraints import constraint_forces
+    from physjax.first_order import ode_scene
     from physjax.live import explore
     from physjax.physics import contacts, emitters, rigid, springs
     from physjax.physics.forces import flows as fields
@@ -149,6 +150,7 @@ __all__ = [
     "loads",
     "methods",
     "minimise",
+    "ode_scene",
     "ode_term",
     "physics",
     "plot",
@@ -189,6 +191,7 @@ _LAZY = {
     "inertia": "physjax.physics.rigid.inertia",
     "lattices": "physjax.physics.springs.lattices",
     "minimise": "physjax.study.inverse.solve:minimise",
+    "ode_scene": "physjax.first_order:ode_scene",
     "plot": "physjax.show.plot",
     "projectile": "physjax.projectile",
     "rigid": "physjax.physics.rigid",

@@ -49,9 +49,8 @@ def holds_user_code(part: PyTree) -> bool:
     """Whether anything in a part of a scene, a method or a motion is not the library's own, and may close over a number."""
     if isinstance(part, Function):
         return not _is_library_definition(part.function)
-    if isinstance(part, Partial) and not _is_library_definition(part.func):
-        return True
-    if isinstance(part, eqx.Module) and not _is_library_definition(type(part)):
+    what = part.func if isinstance(part, Partial) else type(part)
+    if isinstance(part, Partial | eqx.Module) and not _is_library_definition(what):
         return True
     children = jax.tree.leaves(part, is_leaf=lambda node: node is not part)
     return any(holds_user_code(child) for child in children if child is not part)
@@ -98,6 +97,8 @@ class Force(eqx.Module):
     """Whether it is proportional to mass and gives an `acceleration`, as a `Field` does."""
     dissipative_symmetric: ClassVar[bool] = False
     """Whether its Jacobian is symmetric and takes energy, as that of springs: implicit steps then use conjugate gradients."""
+    lane_by_lane: ClassVar[bool] = False
+    """Whether the functions in it are called for one lane at a time, so that they close over no array of all lanes."""
     sees_moments: ClassVar[bool] = False
     """Whether it takes the time as a `Moment`, which keeps what one float32 cannot hold."""
 
@@ -272,8 +273,7 @@ def build_memory_mask(part: PyTree) -> PyTree:
     if part is None or not part.memory:
         return mask
     if all(getattr(part, name) is None for name in part.memory):
-        name = type(part).__name__
-        raise ValueError(f"{name}: got one that no scene has prepared; give it to Scene(...), not to replace().")
+        raise ValueError(f"{type(part).__name__}: no scene has prepared it; give it to Scene(...), not to replace().")
     return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
 
 

@@ -21,6 +21,9 @@ from physjax.checks import ENTRY_AXIS_COUNT, Quantity, starts_outside
 PER_LANE = ("lane", "table", "point")
 """What there may be one of for each lane, given by the user."""
 
+MAX_COMPONENTS = 16
+"""Components of a record beyond which it is a table, as the unknowns of a grid are, and no vector to be split."""
+
 
 @runtime_checkable
 class Related(Protocol):
@@ -61,7 +64,8 @@ class Number(NamedTuple):
         """Whether its last axis counts the components of a vector: of a record it comes after those of the lanes."""
         shape = np.shape(self.value)
         if self.quantity is None:
-            return self.owner is None and len(shape) == len(lanes) + 1 and shape[:-1] == lanes
+            fits = len(shape) == len(lanes) + 1 and shape[:-1] == lanes
+            return self.owner is None and fits and shape[-1] <= MAX_COMPONENTS
         own = self.quantity.axes(dim)
         return len(own) == 1 and shape[-1:] == own
 

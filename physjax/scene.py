@@ -185,7 +185,8 @@ class Scene(eqx.Module):
 
         A plain function may close over one, a path has one, and so may a part whose arrays are not declared.
         """
-        whole = self.couples or self.prescribed_motion is not None or bool(find_plain_functions(self.forces))
+        hiding = find_plain_functions([force for force in self.forces if not force.lane_by_lane])
+        whole = self.couples or self.prescribed_motion is not None or bool(hiding)
         return not whole and not may_hide_lanes(self, self.state.lanes, self.state.position.shape[-1])
 
     def build_lane_mask(self, tree: PyTree) -> PyTree:

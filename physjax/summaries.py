@@ -131,7 +131,8 @@ def describe_scene(scene: Any) -> tuple[str, list[Row]]:
     state = scene.state
     *lanes, dim = state.position.shape
     number = int(np.prod(lanes))
-    kind = "rigid body" if state.rotates else "particle"
+    moves = hasattr(state, "velocity") or state.rotates
+    kind = "rigid body" if state.rotates else "particle" if moves else "system"
     moving = count(number, kind, "rigid bodies" if state.rotates else None)
     if scene.couples and number > 1:
         batch = int(np.prod(lanes[:-1]))
@@ -139,6 +140,12 @@ def describe_scene(scene: Any) -> tuple[str, list[Row]]:
             "bodys", "bodies"
         )
     title = f"Scene: {moving} in {dim}-D, {state.dtype}"
+    if not moves:
+        law = [("rate" if i == 0 else "", repr(force)) for i, force in enumerate(scene.forces)]
+        return f"Scene: {moving}, first order in {count(dim, 'variable')}, {state.dtype}", [
+            ("y", format_array(state.position)),
+            *law,
+        ]
     rows = [("position", format_array(state.position, "m"))]
     if not state.rotates:
         rows.append(("velocity", format_array(state.velocity, "m/s")))

@@ -52,7 +52,7 @@ def _describe_structure(tree: PyTree) -> tuple:
 
 def _find_fault(state: PyTree, mass: PyTree, force: Callable) -> str | None:
     """What is wrong with a force; None where nothing is."""
-    fault = _find_wrong_arguments(force)
+    fault = find_wrong_arguments(force, 3, "the three arguments (t, state, mass)")
     if fault is not None:
         return fault
     try:
@@ -76,18 +76,18 @@ def _find_fault(state: PyTree, mass: PyTree, force: Callable) -> str | None:
     return None
 
 
-def _find_wrong_arguments(force: Callable) -> str | None:
-    """Whether a force takes other arguments than three."""
-    function = force.function if isinstance(force, Function) else force
+def find_wrong_arguments(part: Callable, count: int, expected: str) -> str | None:
+    """What a function of the user takes, where that is not `count` arguments, and what is expected; None where it is."""
+    function = part.function if isinstance(part, Function) else part
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # made in C: it has none
         return None
     try:
-        signature.bind(0.0, None, None)
+        signature.bind(*(None,) * count)
     except TypeError:
-        return f"takes {signature}, expected the three arguments (t, state, mass)."
+        return f"takes {signature}, expected {expected}."
     return None
 
 
-__all__ = ["find_faulty_force"]
+__all__ = ["find_faulty_force", "find_wrong_arguments"]

@@ -38,6 +38,7 @@ FLOORS = (
         "old_names",
         "components",
         "programs",
+        "custom_transpose",
     },
     {
         "roots",
@@ -56,7 +57,7 @@ FLOORS = (
     {"parts"},
     {"pins", "stages", "trials"},
     {"scene"},
-    {"memories"},
+    {"memories", "first_order"},
     {"constraints", "select", "crossing", "moments", "run_files"},
     {"trajectory"},
     {"physics", "stepping"},

@@ -15,8 +15,8 @@ from jax import lax
 from jaxtyping import Array
 
 from physjax.backend import store_on_any_device
+from physjax.custom_transpose import apply_linear
 from physjax.particles import sum_terms
-from physjax.physics.springs.custom_transpose import apply_linear
 from physjax.vectors import AnyArray, components, stack_components
 
 Vector = list[Array]

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from physjax.backend import SPRINGS_AT_BOTH_ENDS, splits_vectors
 from physjax.checks import NestedArrayLike
+from physjax.custom_transpose import apply_linear
 from physjax.physics.springs.component_neighbours import GatheredNodes, ShiftedNodes
-from physjax.physics.springs.custom_transpose import apply_linear
 from physjax.physics.springs.neighbours import Bands, Table, rank_in_group
 
 LAYOUTS = ("bands", "gather")
