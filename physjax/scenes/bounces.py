@@ -5,8 +5,12 @@ Contacts act on the centre of a ball, so each surface is a radius in front of th
 
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
 
 from physjax.particles import Particles
 from physjax.physics import contacts, forces
@@ -14,6 +18,7 @@ from physjax.scene import Scene
 from physjax.scenes.registry import scene
 from physjax.study.energy.quantities import ENERGY
 from physjax.study.problem import Problem, Truth
+from physjax.trajectory import Trajectory
 
 SHORTEST_BOUNCE_SECONDS = 1e-7
 """A ball whose flight is shorter than this lies on the floor: it rises by less than a nanometre."""
@@ -137,6 +142,50 @@ def balls_in_a_box(count: int = 64, seed: int = 0) -> Problem:
                 1e-12,
             ),
         ),
+    )
+
+
+class SpinUp(eqx.Module):
+    """The angle of a room that spins at a constant rate [rad/s]."""
+
+    rate: jax.Array
+
+    def __call__(self, t: ArrayLike) -> Array:
+        """Ω t [rad]."""
+        return self.rate * t
+
+
+@scene
+def spinning_room(spin: float = 1.5, count: int = 48, seed: int = 0) -> Problem:
+    """Balls in a square room of a space station, which spins: its elastic walls hit them, and carry none of them along.
+
+    In the frame of the room ½|u|² - ½Ω²r², Jacobi's integral, is constant in flight and through every bounce.
+    """
+    random = np.random.default_rng(seed)
+    position, velocity = random.uniform(-0.9, 0.9, (count, 2)), random.normal(size=(count, 2))
+    spun = contacts.Motion(angle=SpinUp(jnp.asarray(float(spin))))
+    walls = contacts.Room((-1.0, -1.0), (1.0, 1.0), motion=spun)
+    balls = Scene(Particles(jnp.asarray(position), jnp.asarray(velocity)), mass=2.7e-3, contacts=(walls,))
+
+    def jacobi(flight: Trajectory) -> np.ndarray:
+        x, v = np.asarray(flight.position), np.asarray(flight.velocity)
+        seen = v - spin * np.stack([-x[..., 1], x[..., 0]], axis=-1)
+        return 0.5 * (seen * seen).sum(axis=-1) - 0.5 * spin**2 * (x * x).sum(axis=-1)
+
+    def beyond(flight: Trajectory) -> np.ndarray:
+        angle = spin * np.asarray(flight.time)[:, None]
+        (c, s), x = (np.cos(angle), np.sin(angle)), np.asarray(flight.position)
+        inside = np.stack([c * x[..., 0] + s * x[..., 1], c * x[..., 1] - s * x[..., 0]])
+        return np.maximum(np.abs(inside) - 1.0, 0.0)
+
+    return Problem(
+        balls,
+        duration=2.0,
+        truths=(
+            Truth("Jacobi's integral is conserved [m²/s²]", lambda f: jacobi(f) - jacobi(f)[:1], 0.0, 1e-9),
+            Truth("no ball leaves the room [m]", beyond, 0.0, 1e-9),
+        ),
+        frames=48,
     )
 
 
