@@ -72,7 +72,7 @@ def everything(a, b, flat, number, vector, amount):
 
 
 def expected(a, b, flat, number, vector, amount):
-    """The same by NumPy in float64, each with the sum of the magnitudes that its rounding errors are shares of."""
+    """The same by NumPy in extended precision, each with the sum of the magnitudes that its rounding errors are shares of."""
     length, size = np.linalg.norm(a, axis=-1), np.linalg.norm
     left = np.stack([-flat[:, 1], flat[:, 0]], axis=-1)
     products = (size(a, axis=-1) * size(b, axis=-1))[:, None]
@@ -145,12 +145,12 @@ def some(n, dtype, seed=0):
 def check_against_numpy(found, arguments):
     """Each component is within four roundings of the exact one."""
     eps = np.finfo(arguments[0].dtype).eps
-    wanted = expected(*(a.astype(float) for a in arguments))
+    wanted = expected(*(a.astype(np.longdouble) for a in arguments))
     assert found.keys() == wanted.keys()
     for name, (value, magnitude) in wanted.items():
         assert found[name].dtype == arguments[0].dtype, name
         assert found[name].shape == value.shape, name
-        assert np.all(np.abs(np.asarray(found[name], float) - value) <= 4 * eps * magnitude), name
+        assert np.all(np.abs(np.asarray(found[name], np.longdouble) - value) <= 4 * eps * magnitude), name
 
 
 @LANES

@@ -61,7 +61,7 @@ def test_no_impulses_at_any_points_add_energy():
 @pytest.mark.slow
 def test_hundreds_of_random_drops_never_gain_energy():
     rng = np.random.default_rng(1)
-    n = 200
+    n = 100
     size = rng.uniform(0.1, 0.6, (n, 3))
     body = inertia.box(jnp.ones(n), jnp.asarray(size))
     place = np.zeros((n, 3))
@@ -84,7 +84,7 @@ def test_hundreds_of_random_drops_never_gain_energy():
 
     coarse = gain(np.arange(n), 5e-3, 1)
     assert coarse.max() <= 1e-6  # what rk4 makes of the free turns at this step, and so of order 4
-    worst = np.argsort(coarse)[-50:]
+    worst = np.argsort(coarse)[-25:]
     assert gain(worst, 2.5e-3, 2).max() <= coarse.max() / 2**3.7
 
 
