@@ -235,6 +235,13 @@ FORCES = {
     "QuadraticDrag": (3, lambda: forces.QuadraticDrag(0.1, 0.4, **WIND)),
     "SphereDrag": (3, lambda: forces.SphereDrag(0.1, **WIND)),
     "Magnus": (3, lambda: forces.Magnus(0.1, 0.4, (1.0, 2.0, -3.0), **WIND)),
+    "SpinLift": (3, lambda: forces.SpinLift(0.3, (1.0, 2.0, -3.0), **WIND)),
+    "InAir": (
+        3,
+        lambda: forces.InAir(
+            forces.QuadraticDrag(0.1, 0.4), wind=lambda t, x: 0.5 * x, thinning=lambda t, x: jnp.exp(-0.2 * x[..., 1])
+        ),
+    ),
     "Magnus in the plane": (2, lambda: forces.Magnus(0.1, 0.4, -2.0)),
     "Buoyancy": (2, lambda: forces.Buoyancy(density=1e3, radius=0.8, surface=0.1)),
     "RotatingFrame": (3, lambda: forces.RotatingFrame((0.4, 1.0, -0.3), omega_rate=(0.2, 0.0, 0.5))),
