@@ -80,7 +80,7 @@ class SpinLift(Force):
     Example:
         >>> lift = forces.SpinLift(radius=0.037, angular_velocity=100.0)(0.0, ball, shot.mass)
         >>> print(jnp.round(1000 * lift, 1))
-        [-11.1   8.3]
+        [-18.4  13.8]
     """
 
     radius: Numbers = quantity("radius", "m", above=0)
