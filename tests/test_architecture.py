@@ -54,7 +54,7 @@ FLOORS = (
     },
     {"particles", "quantities"},
     {"parts"},
-    {"pins", "stages", "trials"},
+    {"pins", "stages", "trials", "memory_masks"},
     {"scene"},
     {"memories"},
     {"constraints", "select", "crossing", "moments", "run_files"},
