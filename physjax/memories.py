@@ -2,7 +2,7 @@
 
 from jaxtyping import PyTree
 
-from physjax.parts import has_memory
+from physjax.memory_masks import has_memory
 from physjax.scene import Scene
 
 

@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
@@ -170,6 +169,9 @@ class Force(eqx.Module):
         """The force as part of a scene that starts in this state; what it joins is checked here."""
         return self
 
+    def demand_company(self, forces: tuple["Force", ...]) -> None:
+        """Raise a ValueError for other forces of the scene, with which this one would not be right."""
+
     @property
     def up_axis(self) -> int | None:
         """The axis that points up, of a force that has one in a field `up`."""
@@ -267,16 +269,6 @@ class Contact(eqx.Module):
         return self
 
 
-def build_memory_mask(part: PyTree) -> PyTree:
-    """A contact or an emitter with True in place of each array that its `memory` names, False elsewhere."""
-    mask = jax.tree.map(lambda _: False, part)
-    if part is None or not part.memory:
-        return mask
-    if all(getattr(part, name) is None for name in part.memory):
-        raise ValueError(f"{type(part).__name__}: no scene has prepared it; give it to Scene(...), not to replace().")
-    return eqx.tree_at(lambda part: [getattr(part, name) for name in part.memory], mask, [True] * len(part.memory))
-
-
 serve_old_names(Contact, CONTACT_OLD_NAMES)
 
 
@@ -292,26 +284,6 @@ class ParticleSource(eqx.Module):
     @abstractmethod
     def live(self, motion: Callable, scene: PyTree, t: Time, dt: ArrayLike) -> PyTree:
         """The scene after a step, in which each lane moves from its birth, or the start, to its death, or the end."""
-
-
-def has_memory(part: PyTree) -> bool:
-    """Whether a step changes arrays of this part of a scene, as well as the state."""
-    return part is not None and (part.remembers if isinstance(part, Force) else bool(part.memory))
-
-
-def build_advance_mask(force: Force, state: PyTree, mass: PyTree) -> PyTree:
-    """A force with True in place of each array that its `advance` replaces: found by tracing it and comparing identities."""
-    if not force.remembers:
-        return jax.tree.map(lambda _: False, force)
-    masks = []
-
-    def trace(force, state):
-        zero = jnp.zeros((), state.dtype)
-        after, _ = force.advance(zero, zero, state)
-        masks.append(jax.tree.map(lambda before, now: before is not now, force, adopt_force(after)))
-
-    jax.eval_shape(trace, force, state)
-    return masks[0]
 
 
 @cache

@@ -11,8 +11,9 @@ from jaxtyping import Array, PyTree
 
 from physjax.checks import concrete_or_none
 from physjax.memories import replace_memories, select_stateful_parts
+from physjax.memory_masks import build_memory_mask
 from physjax.particles import Particles, callable_name
-from physjax.parts import Contact, as_module, build_memory_mask
+from physjax.parts import Contact, as_module
 from physjax.scene import Scene
 
 

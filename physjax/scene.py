@@ -28,6 +28,7 @@ from physjax.loops import (
     time_for_part,
     to_float_time,
 )
+from physjax.memory_masks import build_advance_mask, build_memory_mask
 from physjax.particles import Particles, demand_state_record
 from physjax.parts import (
     Contact,
@@ -35,8 +36,6 @@ from physjax.parts import (
     ParticleSource,
     as_module,
     as_tuple,
-    build_advance_mask,
-    build_memory_mask,
     find_plain_functions,
     prepare_contact,
     prepare_force,
@@ -135,6 +134,8 @@ class Scene(eqx.Module):
         for contact in self.contacts:
             contact.demand_fit(state, mass)
         self.forces = tuple(force.prepare(state, mass) for force in self.forces)
+        for force in self.forces:
+            force.demand_company(self.forces)
         if (fault := find_faulty_force(state, mass, self.forces)) is not None:
             raise TypeError(fault)
         self.state = state = mark_invalid_lanes(

@@ -55,7 +55,7 @@ FLOORS = (
     },
     {"particles", "quantities"},
     {"parts"},
-    {"pins", "stages", "trials"},
+    {"pins", "stages", "trials", "memory_masks"},
     {"scene"},
     {"memories", "first_order"},
     {"constraints", "select", "crossing", "moments", "run_files"},

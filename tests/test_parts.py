@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from physjax import Force, Particles, Pins, Scene, contacts, emitters, forces, lattices, methods, simulate
-from physjax.parts import Function, adopt_force, has_memory
+from physjax.memory_masks import has_memory
+from physjax.parts import Function, adopt_force
 
 
 def falling(*, forces=(), contacts=(), **options):

@@ -46,6 +46,7 @@ STARTS = {
     "a spring whose ends meet": joined(springs.Springs([[0, 1]], 5.0, 1.0, damping=0.2)),
     "a spring without a length": joined(springs.Springs([[0, 1]], 5.0, 0.0)),
     "a spring without a length that breaks": joined(springs.Springs([[0, 1]], 5.0, 0.0, breaks_at=0.1)),
+    "a spring without a length that yields": joined(springs.Springs([[0, 1]], 5.0, 0.0, yields_at=0.1)),
     "attraction at one point": joined(forces.Gravitation(G=1.0, softening=0.5)),
 }
 

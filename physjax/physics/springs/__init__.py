@@ -7,6 +7,7 @@ Triangles are connected by the vertices that they share; vertices at the same pl
 # Known limitations
 
 - Springs break at the end of a step, so a scene that breaks is first order under every method.
+- Springs yield within a step, with their set kept at its end: second order, and under `implicit_euler` first.
 - `implicit_euler` converges slowly with wind on faces, and in float32 only to about 1e-4 of a step's kick.
 - `stability.limit` takes seconds for thousands of nodes.
 - Reverse mode through springs costs ten to twenty forward runs.

@@ -87,6 +87,7 @@ def build_lattice(
     faces: np.ndarray = NO_FACES,
     shape: tuple[int, ...] | None = None,
     stretch: ArrayLike = 1.0,
+    yields_at: NestedArrayLike | None = None,
 ) -> Lattice:
     """The lattice with nodes at x [m], and `mass` [kg] distributed to them in proportion to `share`.
 
@@ -99,7 +100,7 @@ def build_lattice(
     rest = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]]) * stretch
     state = Particles(jnp.asarray(x, jnp.result_type(float)), jnp.zeros(x.shape, jnp.result_type(float)))
     total = as_real_quantity("mass [kg]", mass, above=0)
-    springs = Springs(pairs, _join_stiffness(present), rest, damping, breaks_at, nodes=len(x))
+    springs = Springs(pairs, _join_stiffness(present), rest, damping, breaks_at, nodes=len(x), yields_at=yields_at)
     node_mass = total * jnp.asarray(share / share.sum(), total.dtype)
     return Lattice(state, node_mass, springs, sets, faces, shape)
 

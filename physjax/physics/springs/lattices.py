@@ -1,7 +1,8 @@
 """Lattices of nodes and springs: rope, cloth, jelly, bridge, and the edges of a mesh.
 
 Each function returns a `Lattice` at rest. Stiffness [N/m] and damping [kg/s] are those of a single spring; a stiffness of
-None leaves that kind of spring out. `mass` [kg] is the total, distributed to the nodes by length, area or volume.
+None leaves that kind of spring out. `breaks_at` and `yields_at` are the strains at which any spring breaks or yields. `mass`
+[kg] is the total, distributed to the nodes by length, area or volume.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,6 +27,7 @@ def rope(
     damping: ArrayLike | None = None,
     length: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
+    yields_at: ArrayLike | None = None,
 ) -> Lattice:
     """A rope from `start` to `end` [m], in the plane or in space, with equally spaced nodes.
 
@@ -50,7 +52,9 @@ def rope(
     index = np.arange(nodes)
     sets = {"start": index == 0, "end": index == nodes - 1}
     sets["ends"] = sets["start"] | sets["end"]
-    return build_lattice(x, kinds, damping, breaks_at, mass, share, sets, shape=(nodes,), stretch=stretch)
+    return build_lattice(
+        x, kinds, damping, breaks_at, mass, share, sets, shape=(nodes,), stretch=stretch, yields_at=yields_at
+    )
 
 
 def cloth(
@@ -65,6 +69,7 @@ def cloth(
     bend: ArrayLike | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
+    yields_at: ArrayLike | None = None,
     corner: NestedArrayLike = (0.0, 0.0, 0.0),
     across: NestedArrayLike = (1.0, 0.0, 0.0),
     down: NestedArrayLike = (0.0, -1.0, 0.0),
@@ -97,7 +102,9 @@ def cloth(
     sets["edge"] = sets["top"] | sets["bottom"] | sets["left"] | sets["right"]
     sets["corners"] = (sets["top"] | sets["bottom"]) & (sets["left"] | sets["right"])
     faces = _triangulate_cells(np.arange(i.size).reshape(shape))
-    return build_lattice(x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape)
+    return build_lattice(
+        x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape, yields_at=yields_at
+    )
 
 
 def _check_sheet_frame(
@@ -126,6 +133,7 @@ def jelly(
     bend: ArrayLike | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
+    yields_at: ArrayLike | None = None,
     corner: NestedArrayLike = (0.0, 0.0, 0.0),
 ) -> Lattice:
     """A block of `size` (x, y, z) [m] with `nodes` (n_x, n_y, n_z) along its sides, its lowest corner at `corner` [m].
@@ -157,7 +165,9 @@ def jelly(
     sets = dict(zip(("left", "right", "bottom", "top", "back", "front"), sides, strict=True))
     sets |= {"surface": (first | last).any(axis=1), "corners": (first | last).all(axis=1)}
     faces = _triangulate_surface(shape)
-    return build_lattice(x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape)
+    return build_lattice(
+        x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape, yields_at=yields_at
+    )
 
 
 def _triangulate_surface(shape: tuple[int, ...]) -> np.ndarray:
@@ -180,6 +190,7 @@ def bridge(
     width: float | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
+    yields_at: ArrayLike | None = None,
 ) -> Lattice:
     """A truss bridge of a `span` [m] along x: two chords, posts, and both diagonals in every panel.
 
@@ -205,7 +216,9 @@ def bridge(
     share = np.bincount(pairs.ravel(), np.repeat(along, 2), len(x))
     sets = {"left": place[:, 0] == 0, "right": place[:, 0] == panels, "deck": place[:, 1] == 0, "top": place[:, 1] == 1}
     sets["supports"] = sets["deck"] & (sets["left"] | sets["right"])
-    return build_lattice(x, [(pairs, stiffness)], damping, breaks_at, mass, share, sets, shape=shape)
+    return build_lattice(
+        x, [(pairs, stiffness)], damping, breaks_at, mass, share, sets, shape=shape, yields_at=yields_at
+    )
 
 
 def _pair_nodes(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.ndarray:

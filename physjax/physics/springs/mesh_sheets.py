@@ -21,6 +21,7 @@ def from_mesh(
     bend: ArrayLike | None = None,
     damping: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
+    yields_at: ArrayLike | None = None,
     weld: float | None = None,
     triangulate: bool = False,
 ) -> Lattice:
@@ -56,7 +57,17 @@ def from_mesh(
             "every vertex in a triangle. Remove the others."
         )
     sets = {"edge": np.isin(np.arange(len(x)), boundary)}
-    return build_lattice(x, [(edges, structural), (opposite, bend)], damping, breaks_at, mass, share, sets, triangles)
+    return build_lattice(
+        x,
+        [(edges, structural), (opposite, bend)],
+        damping,
+        breaks_at,
+        mass,
+        share,
+        sets,
+        triangles,
+        yields_at=yields_at,
+    )
 
 
 def _weld_mesh(x: np.ndarray, faces: np.ndarray, tolerance: float | None) -> tuple[np.ndarray, np.ndarray]:

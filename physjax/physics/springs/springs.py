@@ -23,16 +23,23 @@ class Springs(Force):
     `pairs` `(springs, 2)` are indices into the last lane axis. Stiffness k [N/m], rest length L [m] and damping c
     [kg/s] are numbers for all springs or one each, `(springs,)`; leading axes of scenes make a sweep of them. Coinciding
     ends have no line between them and no force. With `breaks_at`, a strain (l - L)/L, a spring that is stretched beyond it
-    breaks for good, and a run records which are `unbroken`. With `tension_only` they are ropes, which pull where they are
-    longer than L and are slack where they are not. `nodes` is the number of nodes, if the pairs do not name the
-    last. `layout` is "bands" (shifted slices, for lattices) or "gather" (for meshes), by default the faster. Raises
-    ValueError or TypeError for pairs that are not pairs of different nodes, numbers < 0 and shapes that do not match.
+    breaks for good, and a run records which are `unbroken`. With `yields_at`, a strain ε, springs are perfectly plastic
+    (Prandtl's model): the elastic force goes no further than ±k ε L, and how far a spring is strained beyond that stays as
+    its `permanent_set` [m], which is added to the length at rest and recorded too. Both strains are of the L that was given.
+    With `tension_only` they are ropes, which pull where they are longer than L and are slack where they are not (and yield
+    only when stretched). `nodes` is the number of nodes, if the pairs do not name the last. `layout` is "bands" (shifted
+    slices, for lattices) or "gather" (for meshes), by default the faster. Raises ValueError or TypeError for pairs that are
+    not pairs of different nodes, numbers < 0 and shapes that do not match.
 
     Example:
         >>> ends = Particles(jnp.array([[0.0, 0.0], [1.5, 0.0]]), jnp.zeros((2, 2)))
         >>> spring = springs.Springs([[0, 1]], stiffness=10.0, rest_length=1.0)
         >>> print(spring(0.0, ends, 1.0)[:, 0])
         [ 5. -5.]
+        >>> bumper = springs.Springs([[0, 1]], stiffness=10.0, rest_length=1.0, yields_at=0.2)
+        >>> bent, _ = bumper.advance(0.0, 0.1, ends)
+        >>> print(bumper.tension(ends), bent.permanent_set)
+        [2.] [0.3]
     """
 
     couples: ClassVar[bool] = True
@@ -43,6 +50,8 @@ class Springs(Force):
     c: Float[Array, "..."] | None = unchecked_quantity("damping", "kg/s", per="spring", at_least=0)
     limit: Float[Array, "..."] | None = unchecked_quantity("breaks_at", per="spring", at_least=0)
     intact: Bool[Array, "..."] | None = unchecked_quantity("unbroken", per="spring")
+    yield_strain: Float[Array, "..."] | None = unchecked_quantity("yields_at", per="spring", at_least=0)
+    plastic: Float[Array, "..."] | None = unchecked_quantity("permanent set", "m", per="spring")
     tension_only: bool = eqx.field(static=True, default=False)
 
     def __init__(
@@ -56,6 +65,7 @@ class Springs(Force):
         nodes: int | None = None,
         layout: str | None = None,
         tension_only: bool = False,
+        yields_at: NestedArrayLike | None = None,
     ):
         self.tension_only = tension_only
         self.topology = SpringTopology(pairs, None if nodes is None else as_positive_integer("nodes", nodes), layout)
@@ -63,10 +73,11 @@ class Springs(Force):
         self.L = self._lay_out("rest length [m]", rest_length)  # pyright: ignore[reportConstantRedefinition]  # a length
         self.c = None if damping is None else self._lay_out("damping [kg/s]", damping)
         self.limit = None if breaks_at is None else self._lay_out("breaks_at [1]", breaks_at)
-        self.intact = None
-        if self.limit is not None:
-            scenes = jnp.broadcast_shapes(*(a.shape[:-2] for a in (self.k, self.L, self.limit)))
-            self.intact = jnp.broadcast_to(self.topology.present, (*scenes, *self.topology.present.shape))
+        self.yield_strain = None if yields_at is None else self._lay_out("yields_at [1]", yields_at)
+        numbers = [a for a in (self.k, self.L, self.limit, self.yield_strain) if a is not None]
+        shape = (*jnp.broadcast_shapes(*(a.shape[:-2] for a in numbers)), *self.topology.present.shape)
+        self.intact = None if self.limit is None else jnp.broadcast_to(self.topology.present, shape)
+        self.plastic = None if self.yield_strain is None else jnp.zeros(shape, jnp.result_type(*numbers))
 
     @property
     def pairs(self) -> np.ndarray:
@@ -108,6 +119,16 @@ class Springs(Force):
         """Which springs are unbroken; None for springs that cannot break."""
         return None if self.intact is None else self.topology.collect(self.intact)
 
+    @property
+    def yields_at(self) -> Float[Array, "..."] | None:
+        """The strain beyond which a spring yields [1], as given."""
+        return None if self.yield_strain is None else self.topology.collect(self.yield_strain)
+
+    @property
+    def permanent_set(self) -> Float[Array, "*scenes springs"] | None:
+        """How much longer than L each spring is at rest [m], < 0 if it was crushed; None for springs that cannot yield."""
+        return None if self.plastic is None else self.topology.collect(self.plastic)
+
     def __call__(self, t: ArrayLike, state: Particles, mass: Float[Array, "..."]) -> Float[Array, "*scenes nodes dim"]:
         """Σ (k (1 - L/l) + c (d·ḋ)/l²) d over the springs of each node, d to the other end [N]."""
         self._demand_nodes(state)
@@ -115,11 +136,15 @@ class Springs(Force):
         edges, parts = topology.differences(*(state[:1] if c is None else state))
         weights = []
         for slot, d in enumerate(parts[0]):
-            k, L = self._take_slot(slot, self.k, d), self._take_slot(slot, self.L, d)
+            k, L = self._take_slot(slot, self.k, d), self._take_rest_length(slot, d)
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)  # ends that coincide: no division by 0, also in derivatives
             # (k (1 - L/l) + c (d·ḋ)/l²) l², so that one division by l² remains
-            pull = k * (apart - L * square_root(square))
+            if self.yield_strain is None:
+                pull = k * (apart - L * square_root(square))
+            else:
+                length = square_root(square)
+                pull = k * length * self._limit_stretch(slot, length - L, d)
             if c is not None:
                 pull = pull + self._take_slot(slot, c, d) * product(d, parts[1][slot])
             if self.tension_only:
@@ -130,13 +155,16 @@ class Springs(Force):
         return topology.resultant([near.scale_edges(w, e) for w, e in zip(near.store(weights), edges, strict=True)])
 
     def linearised_at(self, t: Time, state: Particles, mass: Float[Array, "..."]) -> LinearisedSprings:
-        """The springs linearised at a state, with a negative semidefinite Jacobian, as an implicit step uses them."""
+        """The springs linearised at a state, with a negative semidefinite Jacobian, as an implicit step uses them.
+
+        What yields has the stiffness with which it would come back.
+        """
         springs = []
         edges, (parts,) = self.topology.differences(state.position)
         for slot, (edge, d) in enumerate(zip(edges, parts, strict=True)):
             square = product(d, d)
             apart = jnp.where(square > 0, square, 1.0)
-            L, unbroken = self._take_slot(slot, self.L, d), self._take_unbroken(slot, d)
+            L, unbroken = self._take_rest_length(slot, d), self._take_unbroken(slot, d)
             if self.tension_only:
                 unbroken = unbroken & (square > L * L)
             k = jnp.where(unbroken, self._take_slot(slot, self.k, d), 0.0)
@@ -150,35 +178,56 @@ class Springs(Force):
         self._demand_nodes(state)
         energies = []
         for slot, d in enumerate(self.topology.parts(state.position)):
-            stretch = square_root(product(d, d)) - self._take_slot(slot, self.L, d)
+            stretch = square_root(product(d, d)) - self._take_rest_length(slot, d)
             if self.tension_only:
                 stretch = jnp.maximum(stretch, 0.0)
-            energy = 0.25 * self._take_slot(slot, self.k, d) * stretch * stretch
+            # the work of a force that is constant beyond the yield: it becomes heat when the memory advances
+            elastic = self._limit_stretch(slot, stretch, d)
+            energy = 0.25 * self._take_slot(slot, self.k, d) * elastic * (2 * stretch - elastic)
             energies.append(jnp.where(self._take_unbroken(slot, d), energy, 0.0))
         return self.topology.neighbours.sum_at_both_ends(energies)
 
     @property
     def remembers(self) -> bool:
-        """Whether springs can break."""
-        return self.limit is not None
+        """Whether springs can break or yield."""
+        return self.limit is not None or self.yield_strain is not None
 
     def advance(self, t: ArrayLike, dt: ArrayLike, state: Particles) -> tuple["Springs", Particles]:
-        """The springs without those that are stretched beyond `breaks_at`; they stay broken."""
-        if self.limit is None or self.intact is None:
+        """The springs without those stretched beyond `breaks_at`, which stay broken, and with the set of those that yielded."""
+        if not self.remembers:
             return self, state
         self._demand_nodes(state)
-        held = []
+        held, sets = [], []
         for slot, d in enumerate(self.topology.parts(state.position)):
-            L, limit = self._take_slot(slot, self.L, d), self._take_slot(slot, self.limit, d)
-            square = product(d, d)
-            held.append(self._take_slot(slot, self.intact, d) & (square <= (L * (1 + limit)) ** 2))
-        intact = self.topology.neighbours.stack_slots(held)
-        if intact.shape != self.intact.shape:
+            L, square, unbroken = self._take_slot(slot, self.L, d), product(d, d), self._take_unbroken(slot, d)
+            if self.limit is not None:
+                unbroken = unbroken & (square <= (L * (1 + self._take_slot(slot, self.limit, d))) ** 2)
+                held.append(unbroken)
+            if self.yield_strain is not None and self.plastic is not None:
+                most, before = L * self._take_slot(slot, self.yield_strain, d), self._take_slot(slot, self.plastic, d)
+                stretch = square_root(square) - L
+                after = jnp.maximum(before, stretch - most)
+                if not self.tension_only:
+                    after = jnp.minimum(after, stretch + most)
+                sets.append(jnp.where(unbroken, after, before))
+        after = self
+        if self.intact is not None and held:
+            intact = self._stack_memory("breaks_at", self.intact, held, state)
+            after = eqx.tree_at(lambda springs: springs.intact, after, intact)
+        if self.plastic is not None:
+            plastic = self._stack_memory("yields_at", self.plastic, sets, state)
+            after = eqx.tree_at(lambda springs: springs.plastic, after, plastic)
+        return after, state
+
+    def _stack_memory(self, name: str, before: Array, slots: list[Array], state: Particles) -> Array:
+        """What springs remember, from its slots; a ValueError where it was given for other scenes than those of the state."""
+        memory = self.topology.neighbours.stack_slots(slots)
+        if memory.shape != before.shape:
             raise ValueError(
-                f"Springs: got positions of shape {state.position.shape} and breaks_at for the scenes "
-                f"{self.intact.shape[:-2]}; expected a strain for each scene: give breaks_at the shape (*scenes, 1)."
+                f"Springs: got positions of shape {state.position.shape} and {name} for the scenes {before.shape[:-2]}; "
+                f"expected a strain for each scene: give {name} the shape (*scenes, 1)."
             )
-        return eqx.tree_at(lambda springs: springs.intact, self, intact), state
+        return memory
 
     def cut(self, where: NestedArrayLike) -> "Springs":
         """The springs without some, for good: a mask `(springs,)`, or `(*scenes, springs)` for a sweep of cuts.
@@ -209,30 +258,50 @@ class Springs(Force):
         return norm(self._edge_vectors(state.position))
 
     def strain(self, state: Particles) -> Float[Array, "*scenes springs"]:
-        """Strain (l - L)/L of each spring [1]; infinite for a spring of zero rest length."""
+        """Strain (l - L)/L of each spring [1], its permanent set included; infinite for a spring of zero rest length."""
         length = self.length(state)
         rest_length = add_leading_axes(self.rest_length, length.ndim)
         return (length - rest_length) / rest_length
 
     def tension(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """k (l - L) + c l̇ of each spring [N]: positive when it pulls, zero when it is broken, or a rope that is slack."""
-        length = self.length(state)
-        stiffness, rest_length = (add_leading_axes(n, length.ndim) for n in (self.stiffness, self.rest_length))
-        tension = stiffness * (length - rest_length)
+        stretch, elastic = self._measure_stretch(state)
+        tension = add_leading_axes(self.stiffness, stretch.ndim) * elastic
         if self.damping is not None:
             rate = dot(unit(self._edge_vectors(state.position)), self._edge_vectors(state.velocity))
-            tension = tension + add_leading_axes(self.damping, length.ndim) * rate
+            tension = tension + add_leading_axes(self.damping, stretch.ndim) * rate
         if self.tension_only:
-            tension = jnp.where(length > rest_length, jnp.maximum(tension, 0.0), 0.0)
+            tension = jnp.where(stretch > 0, jnp.maximum(tension, 0.0), 0.0)
         return self._zero_broken(tension)
 
     def energy(self, state: Particles) -> Float[Array, "*scenes springs"]:
         """½k(l - L)² of each spring [J], zero when it is broken, or a rope that is slack."""
-        length = self.length(state)
-        stretch = length - add_leading_axes(self.rest_length, length.ndim)
+        stretch, elastic = self._measure_stretch(state)
         if self.tension_only:
-            stretch = jnp.maximum(stretch, 0.0)
-        return self._zero_broken(0.5 * add_leading_axes(self.stiffness, length.ndim) * stretch * stretch)
+            elastic = jnp.maximum(elastic, 0.0)
+        return self._zero_broken(0.5 * add_leading_axes(self.stiffness, stretch.ndim) * elastic * elastic)
+
+    def _measure_stretch(self, state: Particles) -> tuple[Array, Array]:
+        """How much longer each spring is than at rest [m], and how much of it is elastic."""
+        length = self.length(state)
+        rest_length = add_leading_axes(self.rest_length, length.ndim)
+        if self.permanent_set is None or self.yields_at is None:
+            return length - rest_length, length - rest_length
+        stretch = length - rest_length - add_leading_axes(self.permanent_set, length.ndim)
+        most = rest_length * add_leading_axes(self.yields_at, length.ndim)
+        return stretch, jnp.clip(stretch, -most, most)
+
+    def _take_rest_length(self, slot: int, like: list[Array]) -> Array:
+        """L of the springs in a slot, with their permanent set [m]."""
+        L = self._take_slot(slot, self.L, like)
+        return L if self.plastic is None else L + self._take_slot(slot, self.plastic, like)
+
+    def _limit_stretch(self, slot: int, stretch: Array, like: list[Array]) -> Array:
+        """The elastic part of how much the springs in a slot are stretched [m]."""
+        if self.yield_strain is None:
+            return stretch
+        most = self._take_slot(slot, self.L, like) * self._take_slot(slot, self.yield_strain, like)
+        return jnp.clip(stretch, -most, most)
 
     def _take_unbroken(self, slot: int, like: list[Array]) -> Array | np.ndarray:
         """Mask of the unbroken springs of a slot, with as many axes as the components `like`."""

@@ -153,11 +153,11 @@ def _act_alike(part: Part, other: Part, scene: Scene, run: Trajectory) -> bool:
 def _list_simpler_springs(springs: Springs) -> list[tuple[str, Part]]:
     """Springs without damping, and without those of each stiffness (a lattice's structural, shear and bend springs)."""
     count = len(springs.pairs)
-    numbers = (springs.stiffness, springs.rest_length, springs.damping, springs.breaks_at)
+    numbers = (springs.stiffness, springs.rest_length, springs.damping, springs.breaks_at, springs.yields_at)
     if any(number is not None and number.ndim > 1 for number in numbers):
         return []  # swept over scenes
     spread = [None if number is None else np.broadcast_to(np.asarray(number), (count,)) for number in numbers]
-    stiffness, rest_length, damping, breaks_at = spread
+    stiffness, rest_length, damping, breaks_at, yields_at = spread
     assert stiffness is not None
     assert rest_length is not None
 
@@ -170,6 +170,7 @@ def _list_simpler_springs(springs: Springs) -> list[tuple[str, Part]]:
             *options,
             nodes=springs.nodes,
             tension_only=springs.tension_only,
+            yields_at=None if yields_at is None else yields_at[kept],
         )
 
     simpler: list[tuple[str, Part]] = []

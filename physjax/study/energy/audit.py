@@ -87,9 +87,9 @@ def _audit_single_run(run: Trajectory, substeps: Array) -> tuple[EnergyBudget, E
 
 
 def list_causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
-    """Names of the forces, of the contacts, and of the rest: springs that break, constraints, and the method."""
-    breaking = [
-        f"{name} parted"
+    """Names of the forces, of the contacts, and of the rest: springs that break or yield, constraints, and the method."""
+    losing = [
+        _name_loss(name, force)
         for name, force in zip(name_parts(scene.forces), scene.forces, strict=True)
         if _may_lose_energy(force)
     ]
@@ -97,7 +97,7 @@ def list_causes(scene: Scene) -> tuple[list[str], list[str], list[str]]:
     holding += [CLOSING] if scene.constraints and scene.contacts else []
     holding += [PIVOTS] if isinstance(scene.mass, Inertia) and scene.mass.arm is not None else []
     contacts = name_parts(scene.contacts)
-    return name_parts(scene.forces), contacts, [*breaking, *holding, NUMERICAL]
+    return name_parts(scene.forces), contacts, [*losing, *holding, NUMERICAL]
 
 
 def name_parts(parts: tuple) -> list[str]:
@@ -113,6 +113,13 @@ def name_parts(parts: tuple) -> list[str]:
 def _may_lose_energy(force: Force) -> bool:
     """Whether a force may lose energy between two steps: it has memory and a potential, as springs that break."""
     return force.remembers and force.has_potential
+
+
+def _name_loss(name: str, force: Force) -> str:
+    """What the energy that a force of this name loses between two steps is entered as."""
+    if getattr(force, "yields_at", None) is None:
+        return f"{name} parted"
+    return f"{name} yielded" if getattr(force, "breaks_at", None) is None else f"{name} yielded or parted"
 
 
 def cast_to_float64(tree: PyTree) -> PyTree:
@@ -185,8 +192,8 @@ def _audit_step(
         elif stage.name == "close joints":
             budget = _enter(budget, CLOSING, change)
         elif stage.name == "advance memory" and stage.part is not None:
-            loses = _may_lose_energy(scene.forces[stage.part])
-            budget = _enter(budget, f"{forces[stage.part]} parted" if loses else NUMERICAL, change)
+            name, force = forces[stage.part], scene.forces[stage.part]
+            budget = _enter(budget, _name_loss(name, force) if _may_lose_energy(force) else NUMERICAL, change)
         else:
             error = _measure_path_error(scene, stage, after_motion, measure)
             budget = _enter(_enter(budget, NUMERICAL, error), PINS, _subtract(change, error))

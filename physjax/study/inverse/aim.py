@@ -59,7 +59,8 @@ class Shot(NamedTuple):
 
     `angle` is the elevation above the horizontal [rad], beyond a right angle for a shot back along x in the plane; in
     space `azimuth` [rad] is its bearing from x towards z, where z is up from x towards y. Up is what the scene says
-    (`Scene.up`), y by default. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s];
+    (`Scene.up`), y by default. `speed` [m/s], flight `time` [s] and launch `velocity` [m/s], over ground; from a moving
+    launcher angle, azimuth and speed are those relative to it, as its barrel is turned;
     `apex`, the greatest height on the way [m]; `residual`, from the target to where the flight ends [m]. Where `ok` is
     False this is the nearest miss, or what something in the way makes of the shot, and its derivatives are zero.
     """
@@ -134,11 +135,15 @@ class Aimed(eqx.Module):
 
     def scene(self, shot: Shot) -> Scene:
         """The scene with the launch velocity of a shot, to be simulated."""
-        return self.shots.with_launch_velocity(shot.velocity)
+        return self.shots.with_launch_velocity(self._see_from_launcher(shot))
 
     def flight(self, shot: Shot) -> Trajectory:
         """The whole flight of a shot, every step a frame; it ends at the target."""
-        return self.shots.flight(Launch(shot.velocity, shot.time), save_every=1)
+        return self.shots.flight(Launch(self._see_from_launcher(shot), shot.time), save_every=1)
+
+    def _see_from_launcher(self, shot: Shot) -> Array:
+        """The launch velocity relative to the launcher [m/s]."""
+        return shot.velocity if self.shots.launcher is None else shot.velocity - self.shots.launcher
 
     def plot(self, *, every: int = 1, ax: "Axes | None" = None) -> "Axes":
         """Draw both arcs to one target in `every`, and the targets; returns the axes."""
@@ -157,12 +162,14 @@ def aim_at(
     bounces: int = 0,
     method: Callable[..., PyTree] = rk4,
     steps: int = FLIGHT_STEPS,
+    launcher_velocity: ArrayLike | None = None,
 ) -> Aimed:
     """The launches from where the scene's lanes are that hit a target `(*lanes, dim)` [m] at a speed [m/s].
 
     The direction of launch is free; the state's velocity is not used. Without `speed` the least speed that hits is
     found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
     angle and flight time are solved for together, to the last digits, so that the error left is the method's own.
+    From a launcher that moves at `launcher_velocity` [m/s], `(dim,)` or one for each shot, the speed is relative to it.
     Contacts are obstacles, unless the target is to be hit after `bounces` impacts on them (`contacts.impact`). Then a
     fan of directions is tried: `low` is the soonest hit that it leads to, `high` the latest. A target out of reach gives
     `ok` False and the nearest miss. Works under `jit`, `vmap`, and any derivative with respect to the target, the speed
@@ -175,8 +182,11 @@ def aim_at(
         >>> aimed = aim_at(start, (5.0, 0.0), speed=9.9)
         >>> [round(float(np.rad2deg(shot.angle))) for shot in (aimed.low, aimed.high)]
         [15, 75]
+        >>> driving = aim_at(start, (5.0, 0.0), speed=9.9, launcher_velocity=(-2.0, 0.0))
+        >>> print(driving.low.velocity.round(2), round(float(np.rad2deg(driving.low.angle)), 1))
+        [7.32 3.35] 19.8
     """
-    shots = _check_problem(scene, target, method, steps)
+    shots = _check_problem(scene, target, method, steps, launcher_velocity)
     bounces = _check_bounces(bounces, speed, shots.scene)
     if speed is not None:
         speed = as_real_quantity("speed [m/s]", speed, above=0).astype(shots.target.dtype)
@@ -213,7 +223,7 @@ def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounc
     if bounces and speed is not None and late is not None:
         launch, legal = _differentiate_implicitly(shots, speed, lambda: find_ricochet(shots, speed, late, bounces))
     else:
-        free = AimProblem(shots.scene.replace(contacts=()), shots.target, shots.method, shots.steps)
+        free = eqx.tree_at(lambda shots: shots.scene, shots, shots.scene.replace(contacts=()))
         launch, legal = _differentiate_implicitly(free, speed, lambda: _search_free_flight(free, speed, late))
     up = shots.scene.up
     across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
@@ -228,7 +238,7 @@ def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounc
         azimuth=None if len(level) == 1 else jnp.arctan2(level[1], level[0]),
         speed=norm(velocity) if speed is None else speed,
         time=time,
-        velocity=velocity,
+        velocity=shots.over_ground(velocity),
         apex=_stop_gradient_unless(ok, _apex_height(flight.recorded, launch.time / shots.steps)),
         residual=_stop_gradient_unless(ok, residual),
         ok=ok,
@@ -331,7 +341,9 @@ def _check_bounces(bounces: int, speed: ArrayLike | None, scene: Scene) -> int:
     return bounces
 
 
-def _check_problem(scene: Scene, target: ArrayLike, method: Callable[..., PyTree], steps: int) -> AimProblem:
+def _check_problem(
+    scene: Scene, target: ArrayLike, method: Callable[..., PyTree], steps: int, launcher: ArrayLike | None
+) -> AimProblem:
     """Scene and targets with the same lanes, checked."""
     if not isinstance(scene, Scene):
         raise TypeError(f"aim_at: got a {type(scene).__name__}, expected a Scene whose position is where it is fired.")
@@ -368,5 +380,11 @@ def _check_problem(scene: Scene, target: ArrayLike, method: Callable[..., PyTree
     if known_away is not None:
         demand_all("distance from launch to target [m]", away, known_away > 0, "a target away from the launch")
     at_rest = Particles(position, jnp.zeros_like(position))
-    stepper = as_module(method)
-    return AimProblem(scene.replace(state=at_rest), target, stepper, steps)
+    if launcher is not None:
+        launcher = as_real_quantity("launcher_velocity [m/s]", launcher).astype(position.dtype)
+        if launcher.shape not in (shape[-1:], shape):
+            raise ValueError(
+                f"launcher_velocity [m/s]: got shape {launcher.shape}, expected {shape[-1:]} for all shots or {shape}, one each."
+            )
+        launcher = jnp.broadcast_to(launcher, shape)
+    return AimProblem(scene.replace(state=at_rest), target, as_module(method), steps, launcher)

@@ -136,9 +136,12 @@ def _choose_time_grid(shots: AimProblem, speed: Array, bounces: int) -> tuple[Ar
     The last is the latest that a flight at this speed can last without drag, from bounce to bounce.
     """
     distance, rest_acceleration = norm(shots.offset), norm(shots.rest_acceleration)
-    first = distance / (8 * speed)
+    fastest = speed if shots.launcher is None else speed + norm(shots.launcher)
+    first = distance / (8 * fastest)
     idle = 16 * (bounces + 1) * distance / speed
-    arcs = (bounces + 1) * (2 * speed / jnp.where(rest_acceleration > 0, rest_acceleration, 1.0)) + 2 * distance / speed
+    arcs = (bounces + 1) * (
+        2 * fastest / jnp.where(rest_acceleration > 0, rest_acceleration, 1.0)
+    ) + 2 * distance / speed
     last = jnp.where(rest_acceleration > 0, jnp.maximum(arcs, idle / 4), idle)
     return first, (last / first) ** (1 / (FAN_STEPS - 1))
 

@@ -51,19 +51,23 @@ State = TypeVar("State")
 
 
 class Launch(NamedTuple):
-    """A launch velocity [m/s] and the time of flight [s]."""
+    """A launch velocity, relative to the launcher [m/s], and the time of flight [s]."""
 
     velocity: Float[Array, "*lanes dim"]
     time: Float[Array, "*lanes"]
 
 
 class AimProblem(eqx.Module):
-    """Where shots are fired: a scene with a lane for every target [m], the method of the flights and their steps."""
+    """Where shots are fired: a scene with a lane for every target [m], the method of the flights and their steps.
+
+    `launcher` is the velocity of what they are fired from [m/s]; None: it is at rest.
+    """
 
     scene: Scene = eqx.field(metadata=RECORD)
     target: Float[Array, "*lanes dim"] = eqx.field(metadata=RECORD)
     method: Callable[..., PyTree]
     steps: int = eqx.field(static=True)
+    launcher: Float[Array, "*lanes dim"] | None = eqx.field(metadata=RECORD, default=None)
 
     @property
     def offset(self) -> Float[Array, "*lanes dim"]:
@@ -77,9 +81,13 @@ class AimProblem(eqx.Module):
         return self.scene.acceleration(0.0, Particles(position, jnp.zeros_like(position)))
 
     def with_launch_velocity(self, velocity: Float[Array, "*lanes dim"]) -> Scene:
-        """The scene with these launch velocities [m/s]."""
-        scene = self.scene
+        """The scene with these launch velocities, relative to the launcher [m/s]."""
+        scene, velocity = self.scene, self.over_ground(velocity)
         return Scene(Particles(scene.state.position, velocity), scene.mass, scene.forces, scene.contacts)
+
+    def over_ground(self, velocity: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"]:
+        """The velocity over ground [m/s] of a launch at a velocity relative to the launcher."""
+        return velocity if self.launcher is None else velocity + self.launcher
 
     def flight(
         self, launch: Launch, *, save_every: int | None = None, record: Callable[..., PyTree] | None = None
@@ -109,7 +117,7 @@ class AimProblem(eqx.Module):
 
         A miss beyond the square root of a rounding of the extent is one, wherever the shot is fired.
         """
-        extent = norm(self.offset) + norm(launch.velocity) * launch.time
+        extent = norm(self.offset) + norm(self.over_ground(launch.velocity)) * launch.time
         away = jnp.maximum(norm(self.scene.state.position), norm(self.target))
         eps = float(jnp.finfo(extent.dtype).eps)
         left = eps * jnp.maximum(HIT_ROUNDINGS * extent, self.steps * away)
@@ -148,6 +156,8 @@ def guess_launch(shots: AimProblem, speed: Float[Array, "*lanes"] | None) -> Lau
     idle = distance if speed is None else distance / speed
     time = jnp.where(pulled, jnp.sqrt(2 * distance / jnp.where(pulled, strength, 1.0)), idle)
     velocity = scale(1 / time, shots.offset) - scale(0.5 * time, rest_acceleration)
+    if shots.launcher is not None:
+        velocity = velocity - shots.launcher
     if speed is not None:
         velocity = scale(jnp.minimum(1.0, speed / norm(velocity)), velocity)
     return Launch(velocity, time)

@@ -36,6 +36,12 @@ CASES = {
         {"values": [[2.0, 1.0], [-1.0, 3.0], [4.0, 0.5]]},
         2,
     ),
+    "Rocket": Case(
+        lambda **n: forces.Rocket(flow=0.1, forces=(forces.StokesDrag(0.2),), **n),
+        {"thrust": 3.0, "at": 0.3, "duration": 0.4},
+        {"direction": [1.0, 2.0, -0.5]},
+        3,
+    ),
     "StokesDrag": Case(forces.StokesDrag, {"coefficient": 0.3}, WIND, 3),
     "StokesDrag in still air": Case(forces.StokesDrag, {"coefficient": 0.3}, {}, 2),
     "QuadraticDrag": Case(forces.QuadraticDrag, {"area": 0.1, "coefficient": 0.4, "density": 1.2}, WIND, 3),

@@ -17,14 +17,16 @@ TWICE = pytest.mark.parametrize("twice", [True, False], ids=["at both ends", "on
 ROWS, COLUMNS = 3, 4
 
 
-def build_sheet(layout, *, each=False, breaks_at=None):
+def build_sheet(layout, *, each=False, breaks_at=None, yields_at=None):
     """A crumpled cloth in motion, with pairs in either order and numbers for all springs or for each."""
     random = np.random.default_rng(3)
     sheet = lattices.cloth(1.0, 1.0, rows=ROWS, columns=COLUMNS, mass=0.6, structural=80.0, shear=50.0)
     pairs = np.asarray(sheet.springs.pairs)
     pairs = np.where(random.random((len(pairs), 1)) < 0.5, pairs, pairs[:, ::-1])
     stiffness = random.uniform(50.0, 90.0, len(pairs)) if each else 70.0
-    springs = Springs(pairs, stiffness, 0.9 * sheet.springs.rest_length, 0.3, breaks_at, layout=layout)
+    springs = Springs(
+        pairs, stiffness, 0.9 * sheet.springs.rest_length, 0.3, breaks_at, layout=layout, yields_at=yields_at
+    )
     moved = np.asarray(sheet.state.position) + 0.03 * random.normal(size=sheet.state.position.shape)
     return sheet, springs, Particles(jnp.asarray(moved), jnp.asarray(random.normal(size=moved.shape)))
 
@@ -74,6 +76,18 @@ def test_springs_part_in_the_same_places(layout, twice, monkeypatch):
     compute = lambda state: springs.advance(0.0, 0.1, state)[0].unbroken  # noqa: E731
     parted = np.asarray(compute(state))
     assert 0 < parted.sum() < parted.size
+    compare_as_if_for_a_gpu(monkeypatch, twice, compute, state)
+
+
+@pytest.mark.parametrize(("layout", "twice"), [("bands", True), ("gather", False)])
+def test_springs_yield_by_as_much(layout, twice, monkeypatch):
+    _, springs, state = build_sheet(layout, yields_at=0.1)
+
+    def compute(state):
+        bent = springs.advance(0.0, 0.1, state)[0]
+        return bent.permanent_set, weigh(bent, state), weigh(springs, state)
+
+    assert 0 < np.sum(np.asarray(compute(state)[0]) != 0) < len(springs.pairs)
     compare_as_if_for_a_gpu(monkeypatch, twice, compute, state)
 
 
