@@ -236,6 +236,10 @@ FORCES = {
     "SphereDrag": (3, lambda: forces.SphereDrag(0.1, **WIND)),
     "Magnus": (3, lambda: forces.Magnus(0.1, 0.4, (1.0, 2.0, -3.0), **WIND)),
     "SpinLift": (3, lambda: forces.SpinLift(0.3, (1.0, 2.0, -3.0), **WIND)),
+    "Rocket": (
+        2,
+        lambda: forces.Rocket(3.0, flow=0.1, duration=5.0, direction=(0.6, 0.8), forces=(forces.StokesDrag(0.2),)),
+    ),
     "InAir": (
         3,
         lambda: forces.InAir(
