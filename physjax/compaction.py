@@ -15,6 +15,15 @@ from physjax.backend import GROUPS_PER_SCENE, any_lane, choose_group_lanes, on_c
 WORLDS_PER_GROUP = 32
 """Worlds that are swept at a time, where only some have impacts."""
 
+CONTACTS_PER_TILE = 640
+"""Contacts of one group, over all worlds of a tile, of which what a sub-step computes stays in a core's cache.
+
+1024 stacks of ten boxes, five contacts a group, a 60th of a second in four sub-steps: without tiles, and in tiles of 64, 128,
+256 and 512 worlds, 0.90, 0.83, 1.09, 1.06 and 0.96 M boxes a second in the plane, and 0.047, 0.097, 0.116, 0.104 in space.
+"""
+MIN_WORLDS_PER_TILE = 32
+"""With fewer worlds calls of kernels take longer than what they compute."""
+
 T = TypeVar("T")
 """A tree of arrays that comes back with the same structure and shapes."""
 
@@ -26,6 +35,34 @@ def choose_group_worlds(worlds: int) -> int | None:
     that tumble take 7.5 s for 150 steps in groups of 32, 14 in groups of 128, and 115 without.
     """
     return WORLDS_PER_GROUP if on_cpu() and worlds >= 2 * WORLDS_PER_GROUP else None
+
+
+def choose_tile_worlds(worlds: int, contacts: int) -> int | None:
+    """How many worlds of as many contacts a group go through a sub-step together; None for all of them."""
+    most = max(MIN_WORLDS_PER_TILE, CONTACTS_PER_TILE // contacts)
+    if not on_cpu() or worlds < 2 * most:
+        return None
+    return math.ceil(worlds / math.ceil(worlds / most))
+
+
+def map_worlds(function: Callable[[PyTree], T], worlds: PyTree, count: int, contacts: int) -> T:
+    """`function(worlds)`, tile after tile of them; they are the last axis of all arrays, of those given and those returned.
+
+    `contacts` are those of a world in a group.
+    """
+    size = choose_tile_worlds(count, contacts)
+    if size is None:
+        return function(worlds)
+    tiles = -(-count // size)
+
+    def split(leaf: Array) -> Array:
+        padded = jnp.pad(leaf, [(0, 0)] * (leaf.ndim - 1) + [(0, tiles * size - count)], mode="edge")
+        return jnp.moveaxis(padded.reshape(*leaf.shape[:-1], tiles, size), -2, 0)
+
+    def join(leaf: Array) -> Array:
+        return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], -1)[..., :count]
+
+    return jax.tree.map(join, lax.map(function, jax.tree.map(split, worlds)))
 
 
 def compact_and_apply(

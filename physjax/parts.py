@@ -217,7 +217,7 @@ class Contact(eqx.Module):
     """Something that lanes may not pass. `respond(t, state)` resolves every contact at the end of a step.
 
     A `response(motion, scene, t, dt) -> scene` other than `project` decides when contacts are resolved instead;
-    `memory` names the arrays that it changes.
+    `memory` names the arrays that it changes. With `many_small_kernels` it is compiled for these, however many lanes there are.
 
     Example:
         >>> floor = contacts.Plane(point=(0.0, 0.0), normal=(0.0, 1.0))
@@ -227,6 +227,7 @@ class Contact(eqx.Module):
 
     couples: ClassVar[bool] = False
     response: ClassVar[Callable | None] = None
+    many_small_kernels: ClassVar[bool] = False
     __repr__ = represent_part
     memory: ClassVar[tuple[str, ...]] = ()
 

@@ -88,7 +88,8 @@ def simulate(
     if record is None and is_untransformed(given):
         # an array of a method may be of all lanes, of which a kernel's step is one
         in_kernel = runs_as_kernel(jax.tree.leaves(given)) and all(np.ndim(a) == 0 for a in jax.tree.leaves(method))
-        run = _get_standalone_run(scene.compile_bound, in_kernel)
+        small = scene.compile_bound or any(contact.many_small_kernels for contact in scene.contacts)
+        run = _get_standalone_run(small, in_kernel)
     else:
         run = _run_inside
     return run(scene, method, dt, first_step, steps // save_every, save_every, record)
@@ -175,10 +176,10 @@ _run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
 
 
 @functools.cache
-def _get_standalone_run(compile_bound: bool, in_kernel: bool) -> Callable[..., Trajectory]:
+def _get_standalone_run(many_small_kernels: bool, in_kernel: bool) -> Callable[..., Trajectory]:
     """The compiled run where no transformation is around it; made at the first run, since it asks for the device."""
     run = partial(_run_steps, in_kernel=in_kernel)
-    return jit_untransformed(run, many_small_kernels=compile_bound, static_argnames=RUN_STRUCTURE)
+    return jit_untransformed(run, many_small_kernels=many_small_kernels, static_argnames=RUN_STRUCTURE)
 
 
 def start_memory(scene: Scene, method: Callable, first_step: Array, dt: ArrayLike) -> PyTree:

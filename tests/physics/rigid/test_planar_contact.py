@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from physjax import Scene, contacts, forces, inertia, methods, rigid, simulate
+from physjax.compaction import choose_tile_worlds
 
 CRATE = inertia.planar_plate(1.0, (1.0, 1.0))
 SQUARE = rigid.PlanarShape.box((1.0, 1.0))
@@ -239,6 +240,25 @@ def test_a_world_in_a_batch_is_the_world_alone():
         alone = alone.replace(state=alone.state._replace(position=x))
         one = simulate(alone, methods.verlet, dt=1 / 60, steps=10).state
         np.testing.assert_allclose(one.position, many.position[:, world], rtol=1e-12, atol=1e-13)
+
+
+def test_worlds_in_tiles_are_the_worlds_alone():
+    """Of 131 worlds no tile is full."""
+    speeds = np.linspace(-2.0, 2.0, 131)
+    velocity = np.zeros((131, 20, 2))
+    velocity[:, 0, 0] = speeds
+
+    def slide(velocity):
+        x = np.broadcast_to([[1.5 * k, 0.5] for k in range(20)], velocity.shape)
+        pairs = [(k, k + 1) for k in range(19)]
+        solids = rigid.Solids(DISC, (floor(),), 0.5, coulomb=rough(0.3), pairs=pairs)
+        scene = Scene(rigid.planar_bodies(CRATE, x, velocity=velocity), CRATE, (forces.Gravity(),), (solids,))
+        return simulate(scene, methods.verlet, dt=1 / 60, steps=40, save_every=40).position[-1]
+
+    assert choose_tile_worlds(131, 20 // 2) is not None
+    together, some = slide(velocity), np.array([0, 65, 66, 130])
+    np.testing.assert_allclose(together[some], slide(velocity[some]), rtol=0, atol=1e-12)
+    assert np.ptp(together[:, 0, 0]) > 0.3
 
 
 def test_random_drops_gain_no_energy_and_stay_out_of_each_other():

@@ -123,6 +123,11 @@ class Solids(Contact):
         return solve_contacts
 
     @property
+    def many_small_kernels(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # as in `Surface`
+        """In space: with the older emitters 1024 stacks of ten boxes are 1.4 times as fast, in the plane 0.85 times."""
+        return self.mechanics is SPACE
+
+    @property
     def mechanics(self) -> Mechanics:
         """That of the plane or of space, by the shapes."""
         return SPACE if isinstance(self.shapes[0], Shape) else PLANE

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.backend import materialise
+from physjax.compaction import map_worlds
 from physjax.loops import Time, to_float_time
 from physjax.physics.rigid.solids.impacts import ROUNDING, Bouncing, resolve_impacts
 from physjax.physics.rigid.solids.mechanics import (
@@ -23,6 +24,7 @@ from physjax.physics.rigid.solids.mechanics import (
     Impulses,
     Kept,
     Points,
+    Pose,
     Speeds,
     Touching,
     Velocity,
@@ -79,8 +81,29 @@ def _take_substep(
     h = jnp.broadcast_to(h.reshape(1, -1), (1, world.worlds))
     # stored with worlds last: what is only seen so would be read across memory by all that follows
     start, moved = materialise(t, lambda: tuple(mechanics.read_pose(state, scene) for state in states))
+    way = _Way(start, mechanics.find_mean_rate(start, moved, h), moved.rate, h)
+
+    def hold(some: tuple[tuple, _Way, Kept]) -> tuple[Velocity, Velocity, Kept]:
+        of_worlds, way, kept = some
+        return _hold(world.with_bodies(*of_worlds), way, kept, t)
+
+    places, rates, kept = map_worlds(hold, ((world.mass, world.turning), way, kept), world.worlds, world.groups.size)
+    return mechanics.write_pose(states, places, rates, scene), kept
+
+
+class _Way(NamedTuple):
+    """Where bodies start in a sub-step of h [s], and their mean velocities and those at its end if nothing touches."""
+
+    start: Pose
+    mean: Velocity
+    end: Velocity
+    h: Array
+
+
+def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, Velocity, Kept]:
+    """How much further bodies are [m, rad] and how much faster at the end than if nothing touched, and what is kept."""
+    mechanics, (start, mean, end, h) = world.mechanics, way
     touching = mechanics.find_contacts(world, start.place, t)
-    free = mean, end = mechanics.find_mean_rate(start, moved, h), moved.rate
     changes = map_components(lambda now, after: jnp.abs(after - now), start.rate, end)
     slow = REST_SPEED_STEPS * find_largest(changes[: mechanics.straight])
     before = world.pad_all(start.rate)
@@ -91,9 +114,11 @@ def _take_substep(
     impact = map_components(jnp.subtract, bounced, start.rate)
     bounced = map_components(jnp.add, mean, impact), map_components(jnp.add, end, impact)
     moves, impulses = _hold_apart(world, touching, bounced, held, h)
-    places, rates = (map_components(jnp.subtract, after, before) for after, before in zip(moves, free, strict=True))
-    state = mechanics.write_pose(states, map_components(lambda part: by_world(h[0], part) * part, places), rates, scene)
-    return state, jax.vmap(mechanics.keep)(impulses, touching.contacts)
+    ways, rates = (
+        map_components(jnp.subtract, after, before) for after, before in zip(moves, (mean, end), strict=True)
+    )
+    places = map_components(lambda part: by_world(h[0], part) * part, ways)
+    return places, rates, jax.vmap(mechanics.keep)(impulses, touching.contacts)
 
 
 def _stick(world: World, touching: Touching, speeds: Speeds, rate: Velocity, slow: Array) -> Touching:

@@ -69,6 +69,10 @@ class World(NamedTuple):
         """Floating-point type of all numbers."""
         return self.mass[0].dtype
 
+    def with_bodies(self, mass: Sides, turning: Any) -> "World":
+        """The same contacts, of some of the worlds."""
+        return self._replace(mass=mass, turning=turning)
+
     def pad(self, numbers: Array) -> Array:
         """Numbers of the bodies `(..., bodies, worlds)`, with rows of zeros after them of what does not move."""
         in_front = [(0, 0)] * (numbers.ndim - 2)

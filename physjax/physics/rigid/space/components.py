@@ -9,6 +9,9 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array
 
+MOST_CHOICES = 4
+"""Of more numbers in one array one is taken by a sum or a maximum over all, which is a third of the program."""
+
 Vector = tuple[Array, Array, Array]
 """A vector by its components."""
 
@@ -80,10 +83,17 @@ def sum_parts(parts: Array | Sequence[Array]) -> Array:
 
 def take_part(index: Array, parts: Array | Sequence[Array]) -> Array:
     """The part with this number, of each lane: choices one after the other, which fuse where a gather would not."""
+    if isinstance(parts, Array) and len(parts) > MOST_CHOICES:
+        return jnp.sum(jnp.where(index[None] == _number(parts), parts, 0), axis=0)
     found = parts[0]
     for number in range(1, len(parts)):
         found = jnp.where(index == number, parts[number], found)
     return found
+
+
+def _number(parts: Array) -> Array:
+    """0, 1, 2, ... along the axis in front."""
+    return jnp.arange(len(parts), dtype=jnp.int32).reshape(-1, *(1,) * (parts.ndim - 1))
 
 
 def take_vector(index: Array, vectors: Vector) -> Vector:
@@ -93,6 +103,9 @@ def take_vector(index: Array, vectors: Vector) -> Vector:
 
 def find_best(parts: Array | Sequence[Array]) -> tuple[Array, Array]:
     """The greatest of several numbers, and which one it is."""
+    if isinstance(parts, Array) and len(parts) > MOST_CHOICES:
+        best = jnp.max(parts, axis=0)
+        return best, jnp.min(jnp.where(parts == best[None], _number(parts), len(parts) - 1), axis=0)
     best, index = parts[0], jnp.zeros(parts[0].shape, jnp.int32)
     for number in range(1, len(parts)):
         best, index = jnp.maximum(best, parts[number]), jnp.where(parts[number] > best, number, index)

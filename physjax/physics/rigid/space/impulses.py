@@ -14,7 +14,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from physjax.backend import block_fusion, materialise
+from physjax.backend import any_lane, block_fusion, materialise
 from physjax.physics.rigid.solids.mechanics import ALTERNATIONS, SOFT, Demand, Impulses, Points, Sides, Speeds, Velocity
 from physjax.physics.rigid.space.components import (
     Vector,
@@ -310,24 +310,32 @@ def _slide(matrix: list[list[Array]], speeds: list[Array], most: Array) -> list[
     matrix = [
         [jnp.where(own > 0, k, 1.0 if i == j else 0.0) for j, k in enumerate(row)] for i, row in enumerate(matrix)
     ]
-    whole = square_root(sum_parts([part * part for part in _solve_three(matrix, jnp.zeros_like(most), speeds)]))
+    whole = _solve_three(matrix, jnp.zeros_like(most), speeds)
     # of less than that only the direction is left to find
-    bound = jnp.maximum(most, LEAST_SHARE * whole)
+    bound = jnp.maximum(most, LEAST_SHARE * _measure(whole))
     divisor = jnp.where(bound > 0, bound, 1.0)
 
-    def turn(more: Array, _: None) -> tuple[Array, None]:
-        force = _solve_three(matrix, more, speeds)
+    def turn(now: tuple[Array, list[Array]], _: None) -> tuple[tuple[Array, list[Array]], None]:
+        more, force = now
         square = sum_parts([part * part for part in force])
         size = square_root(square)
         bent = sum_parts([part * other for part, other in zip(force, _solve_three(matrix, more, force), strict=True)])
         step = jnp.where(bent != 0, square / jnp.where(bent != 0, bent, 1.0), 0.0) * (size - bound) / divisor
-        return jnp.where(size > bound, more + step, more), None
+        more = jnp.where(size > bound, more + step, more)
+        return (more, _solve_three(matrix, more, speeds)), None
 
-    more, _ = lax.scan(turn, jnp.zeros_like(most), length=SLIDE_TURNS)
-    force = _solve_three(matrix, more, speeds)
-    size = square_root(sum_parts([part * part for part in force]))
+    slides = (_measure(whole) > bound) & (most > 0)
+    begun = jnp.zeros_like(most), whole
+    # at rest nothing slides, and what stops it is found already
+    find = lambda: lax.scan(turn, begun, length=SLIDE_TURNS)[0][1]  # noqa: E731
+    force = lax.cond(any_lane(slides), find, lambda: whole)
+    size = _measure(force)
     share = jnp.where(size > most, most / jnp.where(size > 0, size, 1.0), jnp.where(most > 0, 1.0, 0.0))
     return block_fusion([-share * part for part in force])
+
+
+def _measure(force: list[Array]) -> Array:
+    return square_root(sum_parts([part * part for part in force]))
 
 
 def _solve_three(matrix: list[list[Array]], more: Array, right: list[Array]) -> list[Array]:
