@@ -75,6 +75,8 @@ def triangulate_shape(shape: space.Shape) -> Shape:
     half, radius = np.asarray(shape.half, float), float(shape.radius)
     if shape.kind == "box":
         return box(2 * half)
+    if shape.kind == "hull":
+        return Shape(np.asarray(shape.corners, float), shape.triangles)
     axis = int(np.argmax(half))
     return sphere(radius) if shape.kind == "sphere" else capsule(radius, 2 * half[axis], axis=axis)
 

@@ -50,7 +50,8 @@ class Solids(Contact):
 
     In space a contact has four points, and friction acts at the middle of their pressure and against spin, within an ellipsoid
     of both: exact for what only slides or only spins. With K_r = 1 and friction an oblique hit may gain a few per cent of
-    energy. A box touches curved surfaces with the corners of a face and the point next to them.
+    energy. A box or hull touches curved surfaces with the corners of a face and the point next to them. What is not convex
+    is several bodies held together by `rigid.Welds`.
 
     Example:
         >>> crate, floor = inertia.planar_plate(2.0, (1.0, 1.0)), contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0)

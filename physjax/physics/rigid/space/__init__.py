@@ -7,6 +7,6 @@
     solids = rigid.Solids(rigid.Shape.box((1.0, 1.0, 1.0)), surfaces=(floor,), coulomb=contacts.Coulomb(0.5, 0.5))
     Scene(pile, crate, (forces.Gravity(),), contacts=(solids,))
 
-`boxes`, `segments` and `surfaces` find where shapes touch, and `impulses` holds them apart; `mechanics` hands these to the
-step of `rigid.solids`.
+`boxes`, `segments`, `hulls`, `round_hulls` and `surfaces` find where shapes touch, and `impulses` holds them apart;
+`mechanics` hands these to the step of `rigid.solids`.
 """

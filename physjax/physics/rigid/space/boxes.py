@@ -61,7 +61,7 @@ class _Face(NamedTuple):
     sides: tuple[Array, Array]
 
 
-class _Candidates(NamedTuple):
+class Candidates(NamedTuple):
     """Points of which four are picked [m]: along both sides of the face that is touched and out of it; which ones are any."""
 
     u: Array
@@ -154,7 +154,7 @@ def _meet_face(store: partial, a: Boxes, b: Boxes, axis: _Axis) -> Manifold:
     face = store(lambda: _find_facing(frame, other))
     shares = store(lambda: _clip_edges(face, sides))
     candidates = store(lambda: _list_candidates(face, sides, shares))
-    u, v, out = _pick_four(store, candidates)
+    u, v, out = pick_four(store, candidates)
     sign = jnp.where(axis.on_a, 1.0, -1.0).astype(out.dtype)
     x, y, z = (part[2] for part in frame.axes)
     origin, axes = put_in_front(frame.origin), frame.axes
@@ -225,7 +225,7 @@ def clip_way(start: tuple[Array, Array], way: tuple[Array, Array], sides: tuple[
     return enters, leaves
 
 
-def _list_candidates(face: _Face, sides: Array, shares: tuple[Array, Array]) -> _Candidates:
+def _list_candidates(face: _Face, sides: Array, shares: tuple[Array, Array]) -> Candidates:
     """Where the edges of a face enter and leave a rectangle, and the corners of the rectangle that lie within the face."""
     (starts, ways), (enters, leaves) = _list_edges(face), shares
     on_edges = [
@@ -243,10 +243,10 @@ def _list_candidates(face: _Face, sides: Array, shares: tuple[Array, Array]) -> 
     join = lambda k, last: jnp.concatenate([on_edges[k], on_edges[3 + k], last])  # noqa: E731
     crosses = enters <= leaves
     valid = jnp.concatenate([crosses, crosses, within])
-    return _Candidates(join(0, corners[0]), join(1, corners[1]), join(2, out), valid)
+    return Candidates(join(0, corners[0]), join(1, corners[1]), join(2, out), valid)
 
 
-def _pick_four(store: partial, of: _Candidates) -> tuple[Array, Array, Array]:
+def pick_four(store: partial, of: Candidates) -> tuple[Array, Array, Array]:
     """The deepest of some points, the one furthest from it, and those furthest to either side of the line through both."""
     pick = lambda score: find_best(jnp.where(of.valid, score, -jnp.inf))[1]  # noqa: E731
     first = store(lambda: pick(-of.out))
@@ -261,4 +261,4 @@ def _pick_four(store: partial, of: _Candidates) -> tuple[Array, Array, Array]:
 
 assert len(AROUND) == POINTS
 
-__all__ = ["clip_way", "find_box_manifolds"]
+__all__ = ["AROUND", "PARALLEL_SHARE", "SIDE_SHARE", "Candidates", "clip_way", "find_box_manifolds", "pick_four"]

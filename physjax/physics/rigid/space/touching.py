@@ -1,6 +1,7 @@
 """Where bodies in space touch: contacts with each other and with surfaces, in the groups in which they are solved."""
 
 from functools import partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,12 @@ from physjax.backend import materialise
 from physjax.physics.rigid.solids.mechanics import Sides, Touching
 from physjax.physics.rigid.solids.world import World
 from physjax.physics.rigid.space.boxes import find_box_manifolds
+from physjax.physics.rigid.space.hulls import Hulls, find_hull_manifolds
 from physjax.physics.rigid.space.impulses import Bodies, Contacts, build_contacts
 from physjax.physics.rigid.space.manifolds import Boxes, Manifold
+from physjax.physics.rigid.space.round_hulls import find_round_manifolds
 from physjax.physics.rigid.space.segments import find_segment_manifolds
-from physjax.physics.rigid.space.shapes import tabulate_shapes
+from physjax.physics.rigid.space.shapes import Shape, build_polyhedra, tabulate_shapes
 from physjax.physics.rigid.space.surfaces import find_surface_manifolds
 from physjax.physics.rigid.space.turning import find_rotation
 
@@ -46,10 +49,15 @@ def find_contacts(world: World, place: tuple[Array, ...], t: ArrayLike) -> Touch
 
 def _place_shapes(world: World, center: Array, matrix: Array) -> Boxes:
     """The shapes of all bodies in the world, `(bodies, worlds)`."""
-    shapes = world.solids.shapes
-    table = tabulate_shapes(shapes if len(shapes) == world.size else shapes * world.size, world.dtype)
+    table = tabulate_shapes(_list_shapes(world), world.dtype)
     middle, axes = (center[0], center[1], center[2]), (matrix[0], matrix[1], matrix[2])
     return Boxes(middle, axes, table.half[..., None], table.radius[:, None])
+
+
+def _list_shapes(world: World) -> tuple[Shape, ...]:
+    """The shape of each body."""
+    shapes = world.solids.shapes
+    return shapes if len(shapes) == world.size else shapes * world.size
 
 
 def _find_groups(world: World, boxes: Boxes, t: ArrayLike) -> Manifold:
@@ -59,7 +67,7 @@ def _find_groups(world: World, boxes: Boxes, t: ArrayLike) -> Manifold:
     if groups.of_pairs:
         found.append(jax.tree.map(arrange, _find_pairs(world, boxes, t)))
     if world.slots:
-        surfaces = materialise(t, lambda: find_surface_manifolds(world.slots, t, boxes))
+        surfaces = materialise(t, lambda: find_surface_manifolds(world.slots, t, boxes, _list_shapes(world)))
         found.append(jax.tree.map(partial(world.arrange_by_slot, arrange), surfaces))
     normal, points, gaps, is_point = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-3), *found)
     return Manifold(normal, points, gaps, is_point & jnp.asarray(groups.is_contact)[..., None])
@@ -67,28 +75,39 @@ def _find_groups(world: World, boxes: Boxes, t: ArrayLike) -> Manifold:
 
 def _find_pairs(world: World, boxes: Boxes, t: ArrayLike) -> Manifold:
     """The manifolds of all pairs, `(pairs, worlds)`: those of one kind together, and then in the order of the groups."""
-    groups, shapes = world.groups, world.solids.shapes
-    kinds = [shape.kind == "box" for shape in (shapes if len(shapes) == world.size else shapes * world.size)]
-    is_box = np.array(kinds)
+    groups, shapes = world.groups, _list_shapes(world)
+    kinds = np.array([shape.kind if shape.kind in ("box", "hull") else "round" for shape in shapes])
     a, b = (np.where(rows < world.size, rows, 0)[: groups.of_pairs].ravel() for rows in (groups.a, groups.b))
     found, order = [], []
-    # boxes with boxes; what has no sides with what has, and with its like
-    for both in ((True, True), (True, False), (False, True), (False, False)):
-        chosen = np.flatnonzero((is_box[a] == both[0]) & (is_box[b] == both[1]))
+    for one, other in product(("box", "round", "hull"), repeat=2):
+        chosen = np.flatnonzero((kinds[a] == one) & (kinds[b] == other))
         if not len(chosen):
             continue
         first, second = _select(boxes, a[chosen], t), _select(boxes, b[chosen], t)
         order.append(chosen)
-        if both == (True, True):
-            found.append(find_box_manifolds(t, first, second))
-        elif both == (False, True):
-            found.append(_turn_over(find_segment_manifolds(t, second, first, True)))
-        else:
-            found.append(find_segment_manifolds(t, first, second, both[0]))
+        shaped = [[shapes[row] for row in rows[chosen]] for rows in (a, b)]
+        found.append(_find_manifolds(t, (one, other), (first, second), shaped))
     if len(found) == 1:
         return found[0]
     places = np.argsort(np.concatenate(order))
     return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2)[..., places, :], *found)
+
+
+def _find_manifolds(
+    t: ArrayLike, kinds: tuple[str, str], pair: tuple[Boxes, Boxes], shapes: list[list[Shape]]
+) -> Manifold:
+    """The manifolds of pairs of one kind: what has no sides with what has, and with its like; boxes with boxes; hulls."""
+    a, b = pair
+    if kinds[0] == "round" and kinds[1] != "round":
+        return _turn_over(_find_manifolds(t, (kinds[1], kinds[0]), (b, a), shapes[::-1]))
+    if kinds == ("box", "box"):
+        return find_box_manifolds(t, a, b)
+    if "hull" not in kinds:
+        return find_segment_manifolds(t, a, b, kinds[0] == "box")
+    hull = Hulls(a, build_polyhedra(shapes[0], b.half.dtype))
+    if kinds[1] == "round":
+        return find_round_manifolds(t, hull, b)
+    return find_hull_manifolds(t, hull, Hulls(b, build_polyhedra(shapes[1], b.half.dtype)))
 
 
 def _turn_over(found: Manifold) -> Manifold:
