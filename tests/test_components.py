@@ -252,6 +252,7 @@ FORCES = {
     "RotatingFrame in the plane": (2, lambda: forces.RotatingFrame(0.7, omega_rate=0.2)),
     "Anchor": (3, lambda: forces.Anchor(stiffness=5.0, point=(0.2, -0.1, 0.4), damping=0.3, rest_length=0.9)),
     "Gravitation": (3, lambda: forces.Gravitation(1.0, softening=0.1)),
+    "SoftSpheres": (3, lambda: forces.SoftSpheres(1.5, 30.0, 0.5)),
     "Lorentz": (3, lambda: forces.Lorentz(0.5, (0.3, -1.0, 2.0), (1.0, 0.2, -0.4))),
     "TabulatedDrag": (
         3,

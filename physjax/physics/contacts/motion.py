@@ -117,6 +117,16 @@ class Motion(eqx.Module):
         rest, time = self.rest_place(t, position), jnp.asarray(t, position.dtype)
         return jax.jvp(lambda time: self.place(time, rest), (time,), (jnp.ones_like(time),))[1]
 
+    def spin_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes turns"] | None:
+        """How fast it turns at a time [rad/s], for each position: one number in the plane, three in space; else None."""
+        if self.angle is None:
+            return None
+        time = jnp.asarray(t, position.dtype)
+        rate = jax.jvp(lambda time: self._angle(time, position), (time,), (jnp.ones_like(time),))[1]
+        if self.axis is None:
+            return jnp.broadcast_to(rate[..., None], (*position.shape[:-1], 1))
+        return scale(rate, broadcast_vector(unit(self.axis), position))
+
     def _pivot(self, like: Array) -> Array:
         return jnp.zeros_like(like) if self.pivot is None else broadcast_vector(self.pivot, like)
 

@@ -156,6 +156,15 @@ class Surface(Contact):
         velocity = broadcast_vector(self.velocity, position)
         return velocity if turning is None else velocity + turning
 
+    def spin_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes turns"] | None:
+        """How fast it turns at each position [rad/s]: one number in the plane, three in space; None where it does not."""
+        if self.motion is not None:
+            return self.motion.spin_at(t, position)
+        if self.angular_velocity is None:
+            return None
+        spin_rate = jnp.atleast_1d(self.angular_velocity)
+        return jnp.broadcast_to(spin_rate, (*position.shape[:-1], spin_rate.shape[-1]))
+
     def acceleration_at(self, t: ArrayLike, position: Float[Array, "*lanes dim"]) -> Float[Array, "*lanes dim"] | None:
         """The acceleration of what sticks to the surface there, Ω×(Ω×r) or the motion's [m/s²]; None where it has none."""
         if self.motion is not None:

@@ -1,7 +1,8 @@
 """Loads on particles: weight, drag, lift, springs to a point, gravitation, kicks and controls.
 
 `laws` are functions of position and velocity, `tabulated_drag` is drag by a table, `air` is wind and density that
-change and the lift of spin, `weight` is gravity near the ground and buoyancy, `gravitation` acts between all pairs,
+change and the lift of spin, `weight` is gravity near the ground and buoyancy, `gravitation` acts between all pairs, and
+`soft_spheres` where they overlap,
 `time_dependent` forces are functions of time, `rocket` burns its mass, and `flows` are velocity fields of the air.
 
 A force of your own needs nothing here: any subclass of `Force` (or any function) goes into a scene, and is plotted, swept
@@ -30,11 +31,12 @@ Example:
     verlet: 1.07 s, set by the stiffness of HardSpring, λ = ±1.871i 1/s
 """
 
-from physjax.physics.forces import air, gravitation, laws, rocket, tabulated_drag, time_dependent, weight
+from physjax.physics.forces import air, gravitation, laws, rocket, soft_spheres, tabulated_drag, time_dependent, weight
 from physjax.physics.forces.air import *  # noqa: F403
 from physjax.physics.forces.gravitation import *  # noqa: F403
 from physjax.physics.forces.laws import *  # noqa: F403
 from physjax.physics.forces.rocket import *  # noqa: F403
+from physjax.physics.forces.soft_spheres import *  # noqa: F403
 from physjax.physics.forces.tabulated_drag import *  # noqa: F403
 from physjax.physics.forces.time_dependent import *  # noqa: F403
 from physjax.physics.forces.weight import *  # noqa: F403
@@ -46,6 +48,7 @@ __all__ += air.__all__
 __all__ += gravitation.__all__
 __all__ += laws.__all__
 __all__ += rocket.__all__
+__all__ += soft_spheres.__all__
 __all__ += tabulated_drag.__all__
 __all__ += time_dependent.__all__
 __all__ += weight.__all__

@@ -27,10 +27,12 @@ class Rocket(Force):
 
     `thrust` F [N] acts along a `direction`, or without one along the velocity, and takes a `flow` q [kg/s] of propellant:
     its exhaust leaves at F/q [m/s] (Tsiolkovsky). The mass of the scene is m₀, that at launch. All that acts on the rocket
-    and is not proportional to its mass (drag, wind, a control) stands in `forces`, where it meets m(t); `Gravity` and other
-    fields stand beside the rocket. What a scene says of forces, momenta and energies is that of m₀ at the same velocity and
-    acceleration. Lanes that are no rockets have a thrust and a flow of 0. Methods keep their order where the burn begins and
-    ends with steps; elsewhere a step knows what share of it burns, to second order.
+    and is not proportional to its mass (drag, wind, a control) stands in `forces`, where it meets m(t). So do springs and
+    contact between rockets (`SoftSpheres`), which then conserve the momentum of the masses that are left; contacts with
+    surfaces do not depend on mass. `Gravity` and other fields stand beside the rocket. What a scene says of forces, momenta
+    and energies is that of m₀ at the same velocity and acceleration. Lanes that are no rockets have a thrust and a flow of 0.
+    Methods keep their order where the burn begins and ends with steps; elsewhere a step knows what share of it burns, to
+    second order.
 
     Raises ValueError for a rocket that burns all of its mass, that is at rest without a direction, and for forces beside it
     that would not see m(t); TypeError for forces that it cannot hold: those with a memory, and fields.

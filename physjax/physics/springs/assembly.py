@@ -88,19 +88,29 @@ def build_lattice(
     shape: tuple[int, ...] | None = None,
     stretch: ArrayLike = 1.0,
     yields_at: NestedArrayLike | None = None,
+    volumes: Sequence[np.ndarray] | None = None,
 ) -> Lattice:
     """The lattice with nodes at x [m], and `mass` [kg] distributed to them in proportion to `share`.
 
-    Springs are as long as their ends are apart, times `stretch`.
+    Springs are as long as their ends are apart, times `stretch`. Where each stands for one of `volumes`, kind by kind,
+    stiffness and damping are those of the material: times V/l² they are a spring's.
     """
-    present = [(pairs, stiffness) for pairs, stiffness in kinds if stiffness is not None and len(pairs)]
+    chosen = [i for i, (pairs, stiffness) in enumerate(kinds) if stiffness is not None and len(pairs)]
+    present = [(pairs, stiffness) for pairs, stiffness in (kinds[i] for i in chosen) if stiffness is not None]
     if not present:
         raise ValueError("lattice: got no stiffness, expected at least that of the structural springs.")
     pairs = np.concatenate([pairs for pairs, _ in present])
-    rest = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]]) * stretch
+    lengths = vector_lengths(x[pairs[:, 0]] - x[pairs[:, 1]])
+    rest = lengths * stretch
+    stiffness = _join_stiffness(present)
+    if volumes is not None:
+        # of what is longer than its ends are apart there is more, in the same cross-section
+        shares = jnp.asarray(np.concatenate([volumes[i] for i in chosen]) / lengths**2 / stretch, stiffness.dtype)
+        stiffness = stiffness * shares if stiffness.ndim < 2 else stiffness * shares[(None,) * (stiffness.ndim - 1)]
+        damping = None if damping is None else as_real_quantity("damping", damping, at_least=0) * shares
     state = Particles(jnp.asarray(x, jnp.result_type(float)), jnp.zeros(x.shape, jnp.result_type(float)))
     total = as_real_quantity("mass [kg]", mass, above=0)
-    springs = Springs(pairs, _join_stiffness(present), rest, damping, breaks_at, nodes=len(x), yields_at=yields_at)
+    springs = Springs(pairs, stiffness, rest, damping, breaks_at, nodes=len(x), yields_at=yields_at)
     node_mass = total * jnp.asarray(share / share.sum(), total.dtype)
     return Lattice(state, node_mass, springs, sets, faces, shape)
 

@@ -1,7 +1,12 @@
 """Lattices of nodes and springs: rope, cloth, jelly, bridge, and the edges of a mesh.
 
 Each function returns a `Lattice` at rest. Stiffness [N/m] and damping [kg/s] are those of a single spring; a stiffness of
-None leaves that kind of spring out. `breaks_at` and `yields_at` are the strains at which any spring breaks or yields. `mass`
+None leaves that kind of spring out. Refined with the same numbers, a lattice grows softer or stiffer. With `continuum=True`
+ropes, sheets and blocks are of a material instead, and stretch alike however many nodes they have: a stiffness is EA [N] of
+a rope, the tension per width and strain C [N/m] of a sheet, the modulus E [Pa] of a block, and damping likewise. A spring of
+length l that stands for a volume V (area, length) of them has k = E V/l²: structural and bend springs each resist a pull
+along them with what they are given, and shear springs add to that. (A sheet of them is soft to bending where it is fine.)
+`breaks_at` and `yields_at` are the strains at which any spring breaks or yields. `mass`
 [kg] is the total, distributed to the nodes by length, area or volume.
 """
 
@@ -28,6 +33,7 @@ def rope(
     length: ArrayLike | None = None,
     breaks_at: ArrayLike | None = None,
     yields_at: ArrayLike | None = None,
+    continuum: bool = False,
 ) -> Lattice:
     """A rope from `start` to `end` [m], in the plane or in space, with equally spaced nodes.
 
@@ -38,6 +44,9 @@ def rope(
         >>> rope = lattices.rope((0.0, 0.0), (4.0, 0.0), nodes=5, mass=1.0, stiffness=100.0)
         >>> print(rope.state.position[:, 0], len(rope.springs.pairs))
         [0. 1. 2. 3. 4.] 4
+        >>> rope = lattices.rope((0.0, 0.0), (4.0, 0.0), nodes=9, mass=1.0, stiffness=400.0, continuum=True)
+        >>> print(rope.springs.stiffness)  # EA = 400 N, in eight pieces of half a metre
+        [800. 800. 800. 800. 800. 800. 800. 800.]
     """
     nodes = as_positive_integer("nodes", nodes, at_least=2)
     ends = [np.asarray(as_real_quantity(name, value)) for name, value in (("start [m]", start), ("end [m]", end))]
@@ -52,8 +61,19 @@ def rope(
     index = np.arange(nodes)
     sets = {"start": index == 0, "end": index == nodes - 1}
     sets["ends"] = sets["start"] | sets["end"]
+    volumes = _find_volumes((nodes,), [float(distance) / (nodes - 1)], kinds) if continuum else None
     return build_lattice(
-        x, kinds, damping, breaks_at, mass, share, sets, shape=(nodes,), stretch=stretch, yields_at=yields_at
+        x,
+        kinds,
+        damping,
+        breaks_at,
+        mass,
+        share,
+        sets,
+        shape=(nodes,),
+        stretch=stretch,
+        yields_at=yields_at,
+        volumes=volumes,
     )
 
 
@@ -73,6 +93,7 @@ def cloth(
     corner: NestedArrayLike = (0.0, 0.0, 0.0),
     across: NestedArrayLike = (1.0, 0.0, 0.0),
     down: NestedArrayLike = (0.0, -1.0, 0.0),
+    continuum: bool = False,
 ) -> Lattice:
     """A sheet of `width` × `height` [m], `rows` × `columns` nodes: node (i, j) is number i·columns + j.
 
@@ -102,8 +123,19 @@ def cloth(
     sets["edge"] = sets["top"] | sets["bottom"] | sets["left"] | sets["right"]
     sets["corners"] = (sets["top"] | sets["bottom"]) & (sets["left"] | sets["right"])
     faces = _triangulate_cells(np.arange(i.size).reshape(shape))
+    spacing = lengths[1] / (rows - 1), lengths[0] / (columns - 1)
     return build_lattice(
-        x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape, yields_at=yields_at
+        x,
+        kinds,
+        damping,
+        breaks_at,
+        mass,
+        _compute_node_shares(shape),
+        sets,
+        faces,
+        shape,
+        yields_at=yields_at,
+        volumes=_find_volumes(shape, spacing, kinds) if continuum else None,
     )
 
 
@@ -135,6 +167,7 @@ def jelly(
     breaks_at: ArrayLike | None = None,
     yields_at: ArrayLike | None = None,
     corner: NestedArrayLike = (0.0, 0.0, 0.0),
+    continuum: bool = False,
 ) -> Lattice:
     """A block of `size` (x, y, z) [m] with `nodes` (n_x, n_y, n_z) along its sides, its lowest corner at `corner` [m].
 
@@ -164,9 +197,19 @@ def jelly(
     sides = [end[:, axis] for axis in range(3) for end in (first, last)]
     sets = dict(zip(("left", "right", "bottom", "top", "back", "front"), sides, strict=True))
     sets |= {"surface": (first | last).any(axis=1), "corners": (first | last).all(axis=1)}
-    faces = _triangulate_surface(shape)
+    faces, spacing = _triangulate_surface(shape), lengths / (np.array(shape) - 1)
     return build_lattice(
-        x, kinds, damping, breaks_at, mass, _compute_node_shares(shape), sets, faces, shape, yields_at=yields_at
+        x,
+        kinds,
+        damping,
+        breaks_at,
+        mass,
+        _compute_node_shares(shape),
+        sets,
+        faces,
+        shape,
+        yields_at=yields_at,
+        volumes=_find_volumes(shape, spacing, kinds) if continuum else None,
     )
 
 
@@ -230,6 +273,19 @@ def _pair_nodes(shape: tuple[int, ...], steps: Iterable[tuple[int, ...]]) -> np.
         if all(abs(s) < n for s, n in zip(step, shape, strict=True)):
             pairs.append(np.stack([number[here].ravel(), number[there].ravel()], axis=1))
     return np.concatenate(pairs) if pairs else np.zeros((0, 2), int)
+
+
+def _find_volumes(shape: tuple[int, ...], spacing: Sequence[float] | np.ndarray, kinds: Sequence) -> list[np.ndarray]:
+    """The volume (area, length) that each spring of each kind stands for: on a side of the lattice it is half a cell wide."""
+    found = []
+    for pairs, _ in kinds:
+        ends = zip(np.unravel_index(pairs[:, 0], shape), np.unravel_index(pairs[:, 1], shape), strict=True)
+        volume = np.ones(len(pairs))
+        for (i, j), count, step in zip(ends, shape, spacing, strict=True):
+            on_side = (i == j) & ((i == 0) | (i == count - 1))
+            volume = volume * np.where(on_side, step / 2, step)
+        found.append(volume)
+    return found
 
 
 def _compute_node_shares(shape: tuple[int, ...]) -> np.ndarray:

@@ -20,15 +20,15 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from physjax.backend import jit_untransformed
-from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none, demand_all
+from physjax.checks import as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
 from physjax.linear import solve_columns
-from physjax.particles import Particles, demand_particles
-from physjax.parts import as_module, is_untransformed
-from physjax.physics.contacts.time_of_impact import impact
+from physjax.particles import Particles
+from physjax.parts import is_untransformed
 from physjax.scene import Scene
 from physjax.stepping.methods import rk4
+from physjax.study.inverse.aim_problem import check_bounces, check_problem
 from physjax.study.inverse.ricochet import find_ricochet
 from physjax.study.inverse.shooting import (
     AimProblem,
@@ -130,8 +130,12 @@ class Aimed(eqx.Module):
 
     @property
     def target(self) -> Float[Array, "*lanes dim"]:
-        """The targets [m]."""
+        """The targets at the launch [m]."""
         return self.shots.target
+
+    def meeting_place(self, shot: Shot) -> Float[Array, "*lanes dim"]:
+        """Where the targets are at the end of the flight of a shot [m]."""
+        return self.shots.target_at(shot.time)
 
     def scene(self, shot: Shot) -> Scene:
         """The scene with the launch velocity of a shot, to be simulated."""
@@ -163,6 +167,7 @@ def aim_at(
     method: Callable[..., PyTree] = rk4,
     steps: int = FLIGHT_STEPS,
     launcher_velocity: ArrayLike | None = None,
+    target_velocity: ArrayLike | None = None,
 ) -> Aimed:
     """The launches from where the scene's lanes are that hit a target `(*lanes, dim)` [m] at a speed [m/s].
 
@@ -170,6 +175,7 @@ def aim_at(
     found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
     angle and flight time are solved for together, to the last digits, so that the error left is the method's own.
     From a launcher that moves at `launcher_velocity` [m/s], `(dim,)` or one for each shot, the speed is relative to it.
+    A target that moves at `target_velocity` [m/s], given likewise, is at `target` at the launch.
     Contacts are obstacles, unless the target is to be hit after `bounces` impacts on them (`contacts.impact`). Then a
     fan of directions is tried: `low` is the soonest hit that it leads to, `high` the latest. A target out of reach gives
     `ok` False and the nearest miss. Works under `jit`, `vmap`, and any derivative with respect to the target, the speed
@@ -185,9 +191,12 @@ def aim_at(
         >>> driving = aim_at(start, (5.0, 0.0), speed=9.9, launcher_velocity=(-2.0, 0.0))
         >>> print(driving.low.velocity.round(2), round(float(np.rad2deg(driving.low.angle)), 1))
         [7.32 3.35] 19.8
+        >>> running = aim_at(start, (5.0, 0.0), speed=9.9, target_velocity=(2.0, 0.0))
+        >>> print(running.meeting_place(running.low).round(2))
+        [6.37 0.  ]
     """
-    shots = _check_problem(scene, target, method, steps, launcher_velocity)
-    bounces = _check_bounces(bounces, speed, shots.scene)
+    shots = check_problem(scene, target, method, steps, launcher_velocity, target_velocity)
+    bounces = check_bounces(bounces, speed, shots.scene)
     if speed is not None:
         speed = as_real_quantity("speed [m/s]", speed, above=0).astype(shots.target.dtype)
         if speed.shape not in ((), shots.target.shape[:-1]):
@@ -228,7 +237,7 @@ def _solve_arc(shots: AimProblem, speed: Array | None, late: Array | None, bounc
     up = shots.scene.up
     across = [axis for axis in range(shots.target.shape[-1]) if axis != up]
     flight = shots.flight(launch, save_every=1, record=_HEIGHT_RECORDERS[up])
-    residual = _demand_end(flight) - shots.target
+    residual = _demand_end(flight) - shots.target_at(launch.time)
     ok = legal & (norm(residual) <= shots.rounding(launch))
     velocity, time = launch = _stop_gradient_unless(ok, launch)
     level = [velocity[..., axis] for axis in across]
@@ -325,66 +334,3 @@ def _apex_height(recorded: tuple[Array, Array], dt: Array) -> Array:
 def _stop_gradient_unless(ok: Array, values: State) -> State:
     """The values, without derivatives in lanes that are not ok."""
     return select_where(ok, values, lax.stop_gradient(values))
-
-
-def _check_bounces(bounces: int, speed: ArrayLike | None, scene: Scene) -> int:
-    bounces = as_positive_integer("bounces", bounces, at_least=0)
-    if bounces and speed is None:
-        raise ValueError(
-            "aim_at: got bounces without speed=, expected a speed: the least is found in free flight only."
-        )
-    if bounces and not any(contact.response is impact for contact in scene.contacts):
-        raise ValueError(
-            f"bounces: got {bounces} in a scene without contacts that find the moment of impact, expected some, e.g. "
-            "contacts=(contacts.Plane(point=(0, 0), normal=(0, 1), restitution=0.8),)."
-        )
-    return bounces
-
-
-def _check_problem(
-    scene: Scene, target: ArrayLike, method: Callable[..., PyTree], steps: int, launcher: ArrayLike | None
-) -> AimProblem:
-    """Scene and targets with the same lanes, checked."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"aim_at: got a {type(scene).__name__}, expected a Scene whose position is where it is fired.")
-    if not callable(method):
-        raise TypeError(f"aim_at: got the method {method!r}, expected a method of stepping, e.g. methods.rk4.")
-    steps = as_positive_integer("steps", steps)
-    demand_particles("aim_at", scene.state, "a launch is a position and a velocity")
-    if scene.pinned is not None:
-        raise ValueError("aim_at: got a scene with pinned lanes, expected a launch velocity that is free. Unpin them.")
-    if scene.couples:
-        raise ValueError(
-            "aim_at: got a scene whose forces couple its lanes, expected shots that fly each on its own. Wrap a plain "
-            "function that looks at its own lane only in forces.independent."
-        )
-    position = scene.state.position
-    if position.shape[-1] not in (2, 3):
-        raise ValueError(f"aim_at: got positions with {position.shape[-1]} components, expected 2 or 3.")
-    target = as_real_quantity("target [m]", target).astype(position.dtype)
-    if target.ndim == 0 or target.shape[-1] != position.shape[-1]:
-        raise ValueError(
-            f"target [m]: got shape {target.shape}, expected (*lanes, {position.shape[-1]}), as many components as the "
-            "scene has."
-        )
-    lanes, here = target.shape[:-1], scene.state.lanes
-    if lanes and here and lanes != here:
-        raise ValueError(
-            f"target [m]: got targets of shape {lanes} for a scene of {here} lanes, expected one lane for all targets, "
-            "one target for all lanes, or one for each."
-        )
-    shape = (lanes or here) + position.shape[-1:]
-    position, target = jnp.broadcast_to(position, shape), jnp.broadcast_to(target, shape)
-    away = norm(target - position)
-    known_away = concrete_or_none(away)
-    if known_away is not None:
-        demand_all("distance from launch to target [m]", away, known_away > 0, "a target away from the launch")
-    at_rest = Particles(position, jnp.zeros_like(position))
-    if launcher is not None:
-        launcher = as_real_quantity("launcher_velocity [m/s]", launcher).astype(position.dtype)
-        if launcher.shape not in (shape[-1:], shape):
-            raise ValueError(
-                f"launcher_velocity [m/s]: got shape {launcher.shape}, expected {shape[-1:]} for all shots or {shape}, one each."
-            )
-        launcher = jnp.broadcast_to(launcher, shape)
-    return AimProblem(scene.replace(state=at_rest), target, as_module(method), steps, launcher)

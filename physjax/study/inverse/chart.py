@@ -24,7 +24,9 @@ def draw_shots(aimed: "Aimed", *, every: int = 1, ax: "Axes | None" = None) -> "
     one = np.array_equal(aimed.low.time, aimed.high.time, equal_nan=True)
     arcs = {"both arcs": aimed.low} if one else {"low arc": aimed.low, "high arc": aimed.high}
     paths = {name: _flatten_lanes(aimed.flight(shot).position, 1)[:, ::every] for name, shot in arcs.items()}
-    target = _flatten_lanes(aimed.target)[::every]
+    # what moves is drawn where each arc meets it
+    places = [aimed.meeting_place(shot) for shot in arcs.values()] if aimed.shots.target_velocity is not None else []
+    target = np.concatenate([_flatten_lanes(place)[::every] for place in places or [aimed.target]])
     points = np.concatenate([*(path.reshape(-1, target.shape[-1]) for path in paths.values()), target])
     points = points[np.isfinite(points).all(axis=-1)]
     contacts = obstacles.select_shared_surfaces(aimed.shots.scene.contacts, points.shape[-1])

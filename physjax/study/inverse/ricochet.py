@@ -116,10 +116,12 @@ def _find_closest_approach(shots: AimProblem, velocity: Array, speed: Array, bou
         after = first * growth**i
         dt, x = after - t, scene.state.position
         scene, struck, _ = _step_and_detect_impact(scene, shots.method, t, dt)
-        chord = scene.state.position - x
+        # as the target sees it
+        way = x - shots.target_at(t)
+        chord = scene.state.position - shots.target_at(after) - way
         length = dot(chord, chord)
-        share = jnp.clip(dot(shots.target - x, chord) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
-        away = norm(x + scale(share, chord) - shots.target)
+        share = jnp.clip(-dot(way, chord) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
+        away = norm(way + scale(share, chord))
         better = (count == bounces) & ~struck & (away < best)
         best, when = jnp.where(better, away, best), jnp.where(better, t + share * dt, when)
         return (scene, count + struck.astype(count.dtype), after, best, when), None

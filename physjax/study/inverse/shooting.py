@@ -60,7 +60,7 @@ class Launch(NamedTuple):
 class AimProblem(eqx.Module):
     """Where shots are fired: a scene with a lane for every target [m], the method of the flights and their steps.
 
-    `launcher` is the velocity of what they are fired from [m/s]; None: it is at rest.
+    `launcher` is the velocity of what they are fired from, `target_velocity` that of the targets [m/s]; None: at rest.
     """
 
     scene: Scene = eqx.field(metadata=RECORD)
@@ -68,11 +68,16 @@ class AimProblem(eqx.Module):
     method: Callable[..., PyTree]
     steps: int = eqx.field(static=True)
     launcher: Float[Array, "*lanes dim"] | None = eqx.field(metadata=RECORD, default=None)
+    target_velocity: Float[Array, "*lanes dim"] | None = eqx.field(metadata=RECORD, default=None)
 
     @property
     def offset(self) -> Float[Array, "*lanes dim"]:
-        """From the launch to the target [m]."""
+        """From the launch to the target, at the launch [m]."""
         return self.target - self.scene.state.position
+
+    def target_at(self, time: Float[Array, "*lanes"]) -> Float[Array, "*lanes dim"]:
+        """Where the targets are at a time after the launch [m]."""
+        return self.target if self.target_velocity is None else self.target + scale(time, self.target_velocity)
 
     @property
     def rest_acceleration(self) -> Float[Array, "*lanes dim"]:
@@ -105,12 +110,10 @@ class AimProblem(eqx.Module):
         if steps is None:
             end = self.flight(launch).final_scene
             assert end is not None
-            return end.state.position - self.target
+            return end.state.position - self.target_at(launch.time)
         dt = launch.time / steps.astype(launch.time.dtype)
-        return (
-            sample_states(self.with_launch_velocity(launch.velocity), self.method, dt, steps, 1).position[1]
-            - self.target
-        )
+        flights = sample_states(self.with_launch_velocity(launch.velocity), self.method, dt, steps, 1)
+        return flights.position[1] - self.target_at(launch.time)
 
     def rounding(self, launch: Launch) -> Float[Array, "*lanes"]:
         """The miss that rounding leaves [m]: of the flight's extent and, far from the origin, of a place at every step.
@@ -156,6 +159,8 @@ def guess_launch(shots: AimProblem, speed: Float[Array, "*lanes"] | None) -> Lau
     idle = distance if speed is None else distance / speed
     time = jnp.where(pulled, jnp.sqrt(2 * distance / jnp.where(pulled, strength, 1.0)), idle)
     velocity = scale(1 / time, shots.offset) - scale(0.5 * time, rest_acceleration)
+    if shots.target_velocity is not None:
+        velocity = velocity + shots.target_velocity
     if shots.launcher is not None:
         velocity = velocity - shots.launcher
     if speed is not None:

@@ -96,9 +96,25 @@ def test_traced_numbers_that_leave_no_mass_are_told_by_the_status():
     np.testing.assert_array_equal(jax.vmap(lambda flow: run(flow).ok)(jnp.array([0.5, 1.0])), [True, False])
 
 
+def test_rockets_that_hit_each_other_keep_the_momentum_of_what_is_left_of_them():
+    def hit(flow):
+        state = Particles(jnp.array([[0.0, 0.0], [3.0, 0.0]]), jnp.array([[2.0, 0.0], [-1.0, 0.0]]))
+        crowd = forces.SoftSpheres(radius=0.5, stiffness=2e4)
+        coasting = forces.Rocket(0.0, flow, 0.5, direction=(1.0, 0.0), forces=(crowd,))
+        run = simulate(Scene(state, jnp.array([4.0, 4.0]), (coasting,)), methods.rk4, dt=5e-4, steps=2000)
+        return run.velocity[-1, :, 0]
+
+    # the first has lost three of its four kilogrammes before they meet
+    flow = jnp.array([6.0, 0.0])
+    after = hit(flow)
+    np.testing.assert_allclose(after[0] + 4.0 * after[1], 2.0 - 4.0, rtol=1e-12)
+    np.testing.assert_allclose(after[1] - after[0], 3.0, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("build", "error", "message"),
     [
+        (lambda: Scene(pad().state, M0, (rocket(), forces.SoftSpheres(1.0, 1.0))), ValueError, "SoftSpheres beside it"),
         (lambda: pad(rocket(1.0)), ValueError, r"got 12.0 kg of propellant .* and a mass of 10.0 kg"),
         (lambda: pad(rocket(direction=None)), ValueError, "at rest and no direction"),
         (lambda: rocket(forces=(forces.Gravity(),)), TypeError, "Gravity among its forces"),

@@ -300,9 +300,9 @@ def test_what_does_not_fit_is_refused_in_plain_words():
         Scene(rigid.bodies(inertia.sphere(1.0, 1.0)), inertia.sphere(1.0, 1.0), contacts=(rigid.Solids(SQUARE),))
     with pytest.raises(TypeError, match="PlanarShape"):
         rigid.Solids([(1.0, 1.0)])
-    drum = contacts.Sphere((0.0, 0.0), 1.0, angular_velocity=1.0)
-    with pytest.raises(ValueError, match="stands or moves uniformly"):
-        rigid.Solids(SQUARE, (drum,))
+    led = contacts.Plane((0.0, 0.0), (0.0, 1.0), motion=contacts.Motion(lambda t: jnp.zeros(3) * t))
+    with pytest.raises(ValueError, match="expected 2 components"):
+        Scene(pile, CRATE, contacts=(rigid.Solids(SQUARE, (led,)),))
     many = rigid.planar_bodies(CRATE, np.zeros((65, 2)))
     with pytest.raises(ValueError, match="at most 64"):
         Scene(many, CRATE, contacts=(rigid.Solids(SQUARE),))

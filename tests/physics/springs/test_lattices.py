@@ -252,3 +252,53 @@ def test_files_that_are_no_meshes_are_refused(tmp_path, name, content, message):
 def test_bad_input_is_answered_in_plain_words(build, message, unannotated):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def strip(rows, columns, **more):
+    """A strip of 0.4 m by 1 m of 50 N/m, hung up at its upper edge."""
+    more = {"structural": 50.0, "continuum": True} | more
+    return lattices.cloth(0.4, 1.0, rows, columns, mass=0.1, **more)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(5, 3), (20, 4)])
+def test_a_strip_under_its_weight_and_a_load_stretches_as_its_material_however_fine_it_is(rows, columns):
+    sheet, weight, load = strip(rows, columns), 0.1 * G, 0.7
+    s = -sheet.state.position[:, 1]
+    # with EA = 50 N/m times 0.4 m: what hangs below each place stretches it
+    drop = (weight * (s - s * s / 2) + load * s) / 20.0
+    hanging = Particles(sheet.state.position.at[:, 1].add(-drop), sheet.state.velocity)
+    pull = sheet.springs(0.0, hanging, sheet.mass)[:, 1] - sheet.mass * G
+    share = np.where(sheet.nodes["bottom"], sheet.mass, 0.0)
+    pull = pull - load * share / share.sum()
+    np.testing.assert_allclose(pull[~sheet.nodes["top"]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(pull[sheet.nodes["top"]].sum(), -weight - load, rtol=1e-12)
+
+
+def test_with_shear_springs_a_strip_stretches_alike_too():
+    def stretch(rows):
+        columns = 2 * (rows - 1) // 5 + 1
+        sheet = strip(rows, columns, shear=30.0, damping=0.5)
+        load = np.where(sheet.nodes["bottom"], sheet.mass, 0.0)
+        pull = forces.Constant(np.outer(load / load.sum(), [0.0, -1.0, 0.0]))
+        scene = Scene(sheet.state, sheet.mass, (sheet.springs, pull), pinned=sheet.nodes["top"])
+        end = simulate(scene, methods.implicit_euler, dt=0.05, steps=200, save_every=200).position[-1]
+        return -1.0 - end[sheet.nodes["bottom"], 1].mean()
+
+    found = [stretch(rows) for rows in (6, 21)]
+    np.testing.assert_allclose(found, found[-1], rtol=0.03)
+    # between that of the structural springs alone and that of both side by side
+    assert 1 / (0.4 * 80.0) < found[-1] < 1 / (0.4 * 50.0)
+
+
+def test_a_rope_and_a_block_have_the_stiffness_of_their_material():
+    for nodes in (3, 9):
+        rope = lattices.rope((0, 0), (2, 0), nodes, mass=1.0, stiffness=60.0, damping=6.0, length=3.0, continuum=True)
+        np.testing.assert_allclose(1 / (1 / rope.springs.stiffness).sum(), 60.0 / 3.0)
+        np.testing.assert_allclose(rope.springs.damping, 0.1 * rope.springs.stiffness)
+    block = lattices.jelly((0.5, 2.0, 0.4), (3, 3, 4), mass=1.0, structural=70.0, continuum=True)
+    longer = Particles(block.state.position.at[:, 1].multiply(1.1), block.state.velocity)
+    pull = block.springs(0.0, longer, block.mass)
+    np.testing.assert_allclose(pull[block.nodes["bottom"], 1].sum(), 70.0 * 0.5 * 0.4 * 0.1, rtol=1e-12)
+    stiffness = lambda k: lattices.rope((0, 0), (2, 0), 5, mass=1.0, stiffness=k, continuum=True).springs.stiffness  # noqa: E731
+    np.testing.assert_allclose(jax.jacfwd(stiffness)(60.0), 2.0)
+    np.testing.assert_allclose(stiffness(np.array([[10.0], [60.0]])), [[20.0] * 4, [120.0] * 4])

@@ -103,8 +103,10 @@ def _find_contacts(scene: Scene, solids: Solids, slots: list[Slot], t: ArrayLike
     """The arrays of the contacts, worlds in front."""
     if not solids.pairs and not slots:
         raise ValueError("find_planar_contacts: got solids without pairs or surfaces, expected some that can touch.")
-    world, worlds = build_world(cast("SolidContact", solids), scene), scene.state.lanes[:-1]
-    contacts, gaps, (x, y) = PLANE.find_contacts(world, PLANE.read_pose(scene.state, scene).place, t)
+    # at a moment, which is a sub-step of no length
+    world = build_world(cast("SolidContact", solids), scene, jnp.zeros((), scene.state.dtype))
+    worlds = scene.state.lanes[:-1]
+    contacts, gaps, (x, y), _ = PLANE.find_contacts(world, PLANE.read_pose(scene.state, scene).place, t)
     # each contact's place in the groups; places that are left over come last
     count = len(solids.pairs or ()) + len(slots) * world.size
     places = jnp.asarray(np.argsort(world.groups.contact.ravel(), kind="stable")[:count])

@@ -28,15 +28,16 @@ class Contacts(NamedTuple):
     """All contacts of a step as the solver sees them; every array is `(contacts, worlds)`, or in groups with these in front.
 
     `normal` points from a to b; the tangent is the normal turned left. `torque` is what unit impulses along the three
-    directions turn a and b by [m]; `carried` the speed of b's surface along the tangent and the normal [m/s]; `coupling` by
-    how much a unit impulse along one direction changes the speed along another [1/kg]: tangent with itself and both
-    normals, first normal with itself and the second, second with itself. `mass` and `moment` are the inverse ones of both
-    bodies [1/kg, 1/(kg m²)], `friction` is μ, and `is_point` says which of the two are points.
+    directions turn a and b by [m]; `carried` the speed of b's surface along the tangent and the normal [m/s], or where it
+    may turn the normal at both points; `coupling` by how much a unit impulse along one direction changes the speed along
+    another [1/kg]: tangent with itself and both normals, first normal with itself and the second, second with itself.
+    `mass` and `moment` are the inverse ones of both bodies [1/kg, 1/(kg m²)], `friction` is μ, and `is_point` says which
+    of the two are points.
     """
 
     normal: Vector
     torque: tuple[Directions, Directions]
-    carried: Vector
+    carried: tuple[Array, ...]
     coupling: tuple[Array, ...]
     mass: Sides
     moment: Sides
@@ -70,11 +71,11 @@ def build_contacts(
 
 def find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Directions:
     """How fast b moves away from a along each direction [m/s]."""
-    ((ax, ay, aw), (bx, by, bw)), (nx, ny), (across, along) = ends, contacts.normal, contacts.carried
+    ((ax, ay, aw), (bx, by, bw)), (nx, ny), (across, *along) = ends, contacts.normal, contacts.carried
     dx, dy = bx - ax, by - ay
     turning = [b * bw - a * aw for a, b in zip(*contacts.torque, strict=True)]
-    straight = nx * dx + ny * dy + along
-    return nx * dy - ny * dx + across + turning[0], straight + turning[1], straight + turning[2]
+    straight = [nx * dx + ny * dy + part for part in along]
+    return nx * dy - ny * dx + across + turning[0], straight[0] + turning[1], straight[-1] + turning[2]
 
 
 def find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:

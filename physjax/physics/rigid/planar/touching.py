@@ -14,6 +14,7 @@ from physjax.physics.rigid.planar.manifolds import Manifold, Outline, Vector, fi
 from physjax.physics.rigid.planar.shapes import tabulate_shapes
 from physjax.physics.rigid.planar.surfaces import find_surface_manifolds
 from physjax.physics.rigid.solids.mechanics import Touching
+from physjax.physics.rigid.solids.surface_motion import SurfaceMotion, follow_surfaces
 from physjax.physics.rigid.solids.world import World
 
 
@@ -29,7 +30,21 @@ def find_contacts(world: World, place: tuple[Array, ...], t: ArrayLike) -> Touch
     arm = reach(jnp.asarray(groups.a)), reach(jnp.asarray(groups.b))
     of, (along, across) = world.materials, world.materials.carried
     contacts = build_contacts(t, normal, arm, (along, across), (world.mass, world.turning), of.kinetic, is_point)
-    return Touching(contacts, (gaps[0], gaps[1]), points)
+    touching = Touching(contacts, (gaps[0], gaps[1]), points)
+    find_middle = lambda part: jnp.where(is_point[1], (part[0] + part[1]) / 2, part[0])  # noqa: E731
+    middle = find_middle(points[0]), find_middle(points[1])
+    motions = follow_surfaces(world, t, middle)
+    if motions is None:
+        return touching
+    mean, end = (_see_motion(normal, (points, middle), motion) for motion in motions)
+    return touching._replace(contacts=contacts._replace(carried=mean), carried_at_end=end)
+
+
+def _see_motion(normal: Vector, places: tuple[Vector, Vector], motion: SurfaceMotion) -> tuple[Array, ...]:
+    """The speeds of surfaces along the tangent, and along the normal at both points, given these and their middles."""
+    (nx, ny), (vx, vy), ((px, py), (x, y)) = normal, motion.velocity, places
+    along = [vx * nx + vy * ny + motion.spin[0] * (ny * (px[k] - x) - nx * (py[k] - y)) for k in range(2)]
+    return vy * nx - vx * ny, *along
 
 
 def _find_groups(world: World, outlines: Outline, t: ArrayLike) -> Manifold:

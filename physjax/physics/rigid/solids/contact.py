@@ -33,7 +33,8 @@ class Solids(Contact):
     """Bodies that may not pass each other or the surfaces, in the plane or in space, with restitution K_r and Coulomb's friction.
 
     `shapes` is one for all bodies, or a sequence with one for each in the last lane axis: `rigid.PlanarShape` in the plane,
-    `rigid.Shape` in space. `surfaces` are those of `contacts`, with a restitution and friction of their own. Between bodies
+    `rigid.Shape` in space. `surfaces` are those of `contacts`, with a restitution and friction of their own; they may turn
+    within themselves (turntables, drums) and be led as functions of time (shaken tables, lifts, tumblers). Between bodies
     it is the mean of the two where `restitution` is given for each. `pairs`, `(pairs, 2)`, lists those that can touch:
     without, all pairs, of up to 64 bodies.
 
@@ -112,11 +113,6 @@ class Solids(Contact):
                     "Solids: got a surface with friction= or response=, expected coulomb=Coulomb(static, kinetic) or "
                     "nothing: the others are for particles."
                 )
-            if surface.angular_velocity is not None or surface.motion is not None:
-                raise ValueError(
-                    "Solids: got a surface with angular_velocity= or motion=, expected one that stands or moves uniformly: "
-                    "use velocity=, or a body."
-                )
 
     @property
     def response(self) -> Callable[..., Scene]:  # pyright: ignore[reportIncompatibleVariableOverride]  # as in `Surface`
@@ -171,6 +167,9 @@ class Solids(Contact):
 
     def prepare(self, state: Any, couples: bool) -> "Solids":
         """The contact with its pairs listed and no impulses yet."""
+        for surface in self.surfaces:
+            if surface.motion is not None:
+                surface.motion.demand_fit(type(surface).__name__, state.position.shape[-1])
         bodies = state.lanes[-1]
         pairs = list_pairs(self.pairs, bodies)
         groups = group_contacts(pairs, len(self.mechanics.list_slots(self.surfaces, self.shapes)), bodies)

@@ -53,9 +53,9 @@ def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scen
             f"contacts: got {1 + len(others)} Solids, expected one: it holds all bodies, shapes= one for each, and all surfaces."
         )
     solids: Any = scene.contacts[number]
-    world = build_world(solids, scene)
     dt = jnp.asarray(dt, scene.state.dtype)
     h = dt / solids.substeps
+    world = build_world(solids, scene, h)
     memory = jnp.moveaxis(solids.impulses.reshape(-1, *solids.impulses.shape[-3:]), 0, -1)
 
     def take(carry: tuple[Any, Kept], substep: Array) -> tuple[tuple[Any, Kept], None]:
@@ -87,7 +87,10 @@ def _take_substep(
         of_worlds, way, kept = some
         return _hold(world.with_bodies(*of_worlds), way, kept, t)
 
-    places, rates, kept = map_worlds(hold, ((world.mass, world.turning), way, kept), world.worlds, world.groups.size)
+    some = (world.mass, world.turning), way, kept
+    # worlds with steps of their own have times of their own, and surfaces may move with these
+    together = jnp.ndim(t) == 0 and world.substep.ndim == 0
+    places, rates, kept = map_worlds(hold, some, world.worlds, world.groups.size) if together else hold(some)
     return mechanics.write_pose(states, places, rates, scene), kept
 
 
@@ -105,6 +108,10 @@ def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, 
     mechanics, (start, mean, end, h) = world.mechanics, way
     touching = mechanics.find_contacts(world, start.place, t)
     changes = map_components(lambda now, after: jnp.abs(after - now), start.rate, end)
+    if touching.carried_at_end is not None:
+        # as forces do, surfaces change speeds: by twice as much in a sub-step as in half of it
+        of_surfaces = zip(touching.contacts.carried[: mechanics.straight], touching.carried_at_end, strict=False)
+        changes = *changes[: mechanics.straight], *(2 * jnp.abs(end - mean) for mean, end in of_surfaces)
     slow = REST_SPEED_STEPS * find_largest(changes[: mechanics.straight])
     before = world.pad_all(start.rate)
     speeds = measure_several(mechanics, (before, world.pad_all(mean)), world.groups, touching.contacts)
@@ -151,14 +158,14 @@ def _hold_apart(
     once, which both have in common. It is what the next sub-step starts with; its impulses at the end start with those that
     it has found in the mean. So errors of a sweep do not feed on themselves; friction alone follows that of the mean a little.
     """
-    (mean, end), (contacts, gap, _), mechanics = velocities, touching, world.mechanics
+    (mean, end), (contacts, gap, _, at_end), mechanics = velocities, touching, world.mechanics
     push = sum_impulses(mechanics, contacts, held, world.incidence)
     each, rubbing = by_world(h[0], gap[0]), mechanics.rubbing
 
-    def sweep(this: _Pass, _: Any) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
-        start = world.pad_all(this.velocity)
-        after, pressed = sweep_contacts(mechanics, start, world.groups, contacts, this.demand, this.impulses)
-        opening = measure_openings(mechanics, after, world.groups, contacts)
+    def sweep(this: _Pass, carried: tuple[Array, ...] | None) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
+        start, led = world.pad_all(this.velocity), contacts if carried is None else contacts._replace(carried=carried)
+        after, pressed = sweep_contacts(mechanics, start, world.groups, led, this.demand, this.impulses)
+        opening = measure_openings(mechanics, after, world.groups, led)
         cases = zip(contacts.is_point, pressed[rubbing:], gap, opening, strict=True)
         touches = tuple(is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
         after = world.cut_all(after)
@@ -171,7 +178,8 @@ def _hold_apart(
     overlaps = tuple(s <= 0 for s in gap)
     cure = tuple(jnp.where(over, -SOFT.cure * s, -s) / each for over, s in zip(overlaps, gap, strict=True))
     start = _Pass(map_components(jnp.add, mean, push), held, Demand(cure, overlaps, contacts.is_point))
-    _, (rates, impulses, touches) = lax.scan(sweep, start, length=2)
+    carried = None if at_end is None else jax.tree.map(lambda *both: jnp.stack(both), contacts.carried, at_end)
+    _, (rates, impulses, touches) = lax.scan(sweep, start, carried, length=2)
     moves, stops = (map_components(lambda part, k=k: part[k], rates) for k in range(2))
     first = tuple(active[0] for active in touches)
     keep = lambda stay, impulse: jnp.where(stay, impulse[1] - impulse[0], 0.0)  # noqa: E731

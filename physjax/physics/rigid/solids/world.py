@@ -44,9 +44,9 @@ class Materials(NamedTuple):
 class World(NamedTuple):
     """What does not change in a step: the contact, its groups and materials, and how easily bodies are moved.
 
-    `mass` is 1/m of both bodies of each contact, `(groups, size, worlds)`, 0 of what is held; `turning` what the mechanics
-    need of their inertia; `incidence` says of each body of which places in the groups it is the first and the second shape,
-    in ones and zeros.
+    `substep` is the length of a sub-step [s], `()` or one of each world; `mass` is 1/m of both bodies of each contact,
+    `(groups, size, worlds)`, 0 of what is held; `turning` what the mechanics need of their inertia; `incidence` says of
+    each body of which places in the groups it is the first and the second shape, in ones and zeros.
     """
 
     solids: SolidContact
@@ -54,6 +54,7 @@ class World(NamedTuple):
     size: int
     slots: list[Any]
     groups: Groups
+    substep: Array
     mass: Sides
     turning: Any
     materials: Materials
@@ -94,8 +95,8 @@ class World(NamedTuple):
         return map_components(lambda part: part[..., : self.size, :], velocity)
 
 
-def build_world(solids: SolidContact, scene: Scene) -> World:
-    """What does not change in a step of the scene."""
+def build_world(solids: SolidContact, scene: Scene, substep: Array) -> World:
+    """What does not change in a step of the scene, given the length of its sub-steps [s]."""
     lanes, dtype, mechanics = scene.state.lanes, scene.state.dtype, solids.mechanics
     bodies = lanes[-1]
     slots = mechanics.list_slots(solids.surfaces, solids.shapes)
@@ -106,7 +107,7 @@ def build_world(solids: SolidContact, scene: Scene) -> World:
     on_a, on_b = (jnp.asarray(rows == side.ravel(), dtype) for side in (groups.a, groups.b))
     mass, turning = take_sides(free / scene.mass.mass, groups), mechanics.read_turning(scene, groups, free)
     materials = _mix_materials(solids, slots, groups, (bodies, scene.state.position.shape[-1]), dtype)
-    return World(solids, mechanics, bodies, slots, groups, mass, turning, materials, (on_a, on_b))
+    return World(solids, mechanics, bodies, slots, groups, substep, mass, turning, materials, (on_a, on_b))
 
 
 def take_sides(number: Array, groups: Groups) -> Sides:

@@ -63,14 +63,15 @@ class Contacts(NamedTuple):
 
     `axes` are two tangents and the normal, from a to b, as rows of `(3, 3, ...)`; `swings` how angular velocities of both
     bodies move the origin along these [m]; `places` where the points are along both tangents [m], `(4, ...)`. `carried` is
-    the velocity of b's surface [m/s] in the frame, `(3, ...)`. `mass` [1/kg] and `turning` [1/(kg m²)] are the inverse ones
-    of both bodies, `friction` is μ, and `is_point` says of the points, `(4, ...)`, whether they are there.
+    the velocity of b's surface [m/s] in the frame, `(3, ...)`, and where it may turn its angular one [rad/s]. `mass` [1/kg]
+    and `turning` [1/(kg m²)] are the inverse ones of both bodies, `friction` is μ, and `is_point` says of the points,
+    `(4, ...)`, whether they are there.
     """
 
     axes: Array
     swings: Sides
     places: Sides
-    carried: Array
+    carried: tuple[Array, ...]
     mobility: Mobility
     mass: Sides
     turning: Sides
@@ -96,7 +97,7 @@ def build_contacts(
     mobility = materialise(t, lambda: _find_mobility(axes, swings, bodies))
     speed = jnp.stack([axes[k, 0] * carried[0] + axes[k, 1] * carried[1] + axes[k, 2] * carried[2] for k in range(3)])
     is_point = jnp.broadcast_to(found.is_point, (POINTS, *found.is_point.shape))
-    return Contacts(axes, swings, (x, y), speed, mobility, bodies.mass, bodies.turning, friction, (is_point,))
+    return Contacts(axes, swings, (x, y), (speed,), mobility, bodies.mass, bodies.turning, friction, (is_point,))
 
 
 def _cross_rows(arm: Array, rows: Array) -> Array:
@@ -125,7 +126,8 @@ def find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Speeds:
     """The twist of b relative to a in the frame, `(3, ...)`: velocity of the origin [m/s] and angular velocity [rad/s]."""
     ((va, wa), (vb, wb)), (swing_a, swing_b) = ends, contacts.swings
     straight = multiply(contacts.axes, vb - va) + multiply(swing_b, wb) - multiply(swing_a, wa)
-    return straight + contacts.carried, multiply(contacts.axes, wb - wa)
+    spin, (carried, *turning) = multiply(contacts.axes, wb - wa), contacts.carried
+    return straight + carried, spin + turning[0] if turning else spin
 
 
 def find_openings(speeds: Speeds, contacts: Contacts) -> Array:

@@ -12,11 +12,13 @@ from jaxtyping import Array
 
 from physjax.backend import materialise
 from physjax.physics.rigid.solids.mechanics import Sides, Touching
+from physjax.physics.rigid.solids.surface_motion import SurfaceMotion, follow_surfaces
 from physjax.physics.rigid.solids.world import World
 from physjax.physics.rigid.space.boxes import find_box_manifolds
+from physjax.physics.rigid.space.components import multiply
 from physjax.physics.rigid.space.hulls import Hulls, find_hull_manifolds
 from physjax.physics.rigid.space.impulses import Bodies, Contacts, build_contacts
-from physjax.physics.rigid.space.manifolds import Boxes, Manifold
+from physjax.physics.rigid.space.manifolds import POINTS, Boxes, Manifold
 from physjax.physics.rigid.space.round_hulls import find_round_manifolds
 from physjax.physics.rigid.space.segments import find_segment_manifolds
 from physjax.physics.rigid.space.shapes import Shape, build_polyhedra, tabulate_shapes
@@ -44,7 +46,20 @@ def find_contacts(world: World, place: tuple[Array, ...], t: ArrayLike) -> Touch
         return build_contacts(t, found, bodies, carried, friction), found.gaps
 
     contacts, gap = lax.map(build, (jax.tree.map(first, found), bodies, of.carried, of.kinetic))
-    return Touching(contacts, (gap,), found.points)
+    touching = Touching(contacts, (gap,), found.points)
+    motions = follow_surfaces(
+        world, t, tuple((part[0] + part[1] + part[2] + part[3]) / POINTS for part in found.points)
+    )
+    if motions is None:
+        return touching
+    mean, end = (_see_motion(contacts, motion) for motion in motions)
+    return touching._replace(contacts=contacts._replace(carried=mean), carried_at_end=end)
+
+
+def _see_motion(contacts: Contacts, motion: SurfaceMotion) -> tuple[Array, Array]:
+    """The velocities and angular velocities of surfaces in the frames of contacts."""
+    see = jax.vmap(multiply)
+    return see(contacts.axes, jnp.stack(motion.velocity, axis=1)), see(contacts.axes, jnp.stack(motion.spin, axis=1))
 
 
 def _place_shapes(world: World, center: Array, matrix: Array) -> Boxes:
