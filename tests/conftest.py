@@ -29,6 +29,7 @@ with jaxtyping.install_import_hook("physjax", "beartype.beartype"):
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_traceback_filtering", "off")  # whoever mends physjax wants the frames that its users are spared
 
 
 SLOW = {line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#")}
