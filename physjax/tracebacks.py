@@ -5,10 +5,11 @@ At the public constructors and functions those frames are dropped; `JAX_TRACEBAC
 """
 
 import functools
+import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -54,6 +55,7 @@ def shorten_tracebacks(function: Callable[P, R]) -> Callable[P, R]:
             short = _shorten(error)
             if short is None:
                 raise
+            _add_signature(short, args[0] if args and isinstance(args[0], ShortModule) else function)
         raise short from short.__cause__  # JAX_TRACEBACK_FILTERING=off shows where
 
     return call
@@ -74,6 +76,16 @@ def _shorten(error: Exception) -> Exception | None:
     if not _ends_in_user_code(error.__traceback__):  # our sentence says all
         error.__cause__ = None
     return error.with_traceback(_join(frames))
+
+
+def _add_signature(error: Exception, called: Any) -> None:
+    """Say what a function takes, or a module is built from, where it was called with something else."""
+    name = f"{called.__name__}.__init__()" if isinstance(called, type) else f"{called.__name__}()"
+    words = str(error)
+    if isinstance(error, TypeError) and words.startswith((f"{name} got an unexpected", f"{name} missing")):
+        taken = inspect.signature(called).parameters.values()
+        shown = (p.name if p.default is p.empty else f"{p.name}=" for p in taken)
+        error.args = (f"{words}. It takes {', '.join(shown)}.",)
 
 
 def _list_user_frames(trace: TracebackType | None) -> list[TracebackType]:
@@ -105,6 +117,8 @@ def _join(frames: list[TracebackType]) -> TracebackType | None:
 
 if TYPE_CHECKING:
     from equinox import Module
+
+    ShortModule = type
 else:
     Base = type(eqx.Module)
 

@@ -135,7 +135,12 @@ MISTAKES = {
     ),
     "a force in words": (lambda: forces.Gravity("9.8"), "expected real numbers"),
     "a negative drag": (lambda: forces.StokesDrag(-0.2), "expected numbers >= 0"),
-    "a keyword that is none": (lambda: Scene(BALL, force=()), "unexpected keyword argument 'force'"),
+    "a keyword that is none": (
+        lambda: Scene(BALL, force=()),
+        r"keyword argument 'force'. It takes state, mass=, forces=",
+    ),
+    "a keyword of a part that is none": (lambda: forces.SpinLift(spin=3.0), r"'spin'. It takes \w+"),
+    "a run without a method": (lambda: simulate(FALL), "It takes scene, method, dt"),
     "bodies without inertia": (
         lambda: Scene(rigid.planar_bodies(inertia.planar_disc(1.0, 0.5), [[0.0, 0.0]])),
         "expected a PlanarInertia",
