@@ -1,4 +1,4 @@
-"""Writes README.md and its charts from the results files alone: `python -m benchmarks report`.
+"""Writes README.md, its charts and the project's table of speed from the results files alone: `python -m benchmarks report`.
 
 Nothing of JAX is imported, so that a test can hold the page to the files.
 """
@@ -7,6 +7,8 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from speed_table import README, replace_speed_table
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS, PAGE = FOLDER / "results", FOLDER / "README.md"
@@ -249,7 +251,8 @@ def main() -> None:
     for record in pick_workload(results, "scaling"):
         draw_scaling(RESULTS / name_chart(record), record)
     PAGE.write_text(build_page(results))
-    print(f"written: {PAGE}")
+    README.write_text(replace_speed_table(README.read_text(), results))
+    print(f"written: {PAGE} and the table of speed in {README}")
 
 
 if __name__ == "__main__":

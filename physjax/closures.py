@@ -15,9 +15,8 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from physjax.backend import jit_is_disabled
+from physjax.tracebacks import WRAPPER_PACKAGES
 
-WRAPPER_PACKAGES = {"physjax", "contextlib", "equinox", "jaxtyping", "beartype"}
-"""Packages whose frames are between the user's line, to which a warning points, and the check."""
 _last_compiled: WeakKeyDictionary[CodeType, object] = WeakKeyDictionary()
 """The function that was last compiled from each code object."""
 _warned_codes: WeakKeyDictionary[CodeType, bool] = WeakKeyDictionary()

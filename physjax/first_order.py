@@ -23,6 +23,7 @@ from physjax.particles import callable_name, check_load_shape, sum_terms
 from physjax.parts import Force, as_module, prepare_force
 from physjax.scene import Scene
 from physjax.summaries import format_tree
+from physjax.tracebacks import shorten_tracebacks
 from physjax.trials import find_wrong_arguments
 
 WHOLE_RATE_METHODS = "euler, midpoint, heun, rk4, tsit5 and dopri8, or methods.adaptive of one of them"
@@ -166,6 +167,7 @@ class RateLaw(Force):
         return () if self.parameters is None else (self.parameters,)
 
 
+@shorten_tracebacks
 @jax.transfer_guard("allow")  # what a scene is given goes to the device on purpose
 def ode_scene(f: Callable, y0: ArrayLike, parameters: PyTree = None) -> Scene:
     """Equations of first order, y' = f(t, y), as a `Scene` to be simulated, swept and differentiated: no mechanics needed.

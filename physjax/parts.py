@@ -3,6 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
+from types import new_class
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -19,10 +20,11 @@ from physjax.loops import Time
 from physjax.old_names import CONTACT_OLD_NAMES, FORCE_OLD_NAMES, serve_old_names
 from physjax.particles import Particles, demand_particles
 from physjax.summaries import represent_part
+from physjax.tracebacks import Module
 from physjax.vectors import scale
 
 
-class Function(eqx.Module):
+class Function(Module):
     """A plain function as part of a scene. It counts as coupling lanes unless `forces.independent` says otherwise."""
 
     function: Callable = eqx.field(static=True)
@@ -73,7 +75,7 @@ def _is_library_definition(thing: Any) -> bool:
     return str(getattr(thing, "__module__", "")).startswith("physjax.") and "<locals>" not in thing.__qualname__
 
 
-class Force(eqx.Module):
+class Force(Module):
     """A load on each lane: any callable `(t, state, mass) -> newtons`, shaped like the velocity; the base of our own.
 
     `t` [s] is a scalar or one per lane. `couples` says whether a lane's force depends on other lanes. Numbers are fields
@@ -213,7 +215,7 @@ class Field(Force):
         return scale(mass, self.acceleration(t, state, mass))
 
 
-class Contact(eqx.Module):
+class Contact(Module):
     """Something that lanes may not pass. `respond(t, state)` resolves every contact at the end of a step.
 
     A `response(motion, scene, t, dt) -> scene` other than `project` decides when contacts are resolved instead;
@@ -273,7 +275,7 @@ class Contact(eqx.Module):
 serve_old_names(Contact, CONTACT_OLD_NAMES)
 
 
-class ParticleSource(eqx.Module):
+class ParticleSource(Module):
     """What lets the lanes of a scene be born and die within a step; `memory` names the arrays that this changes."""
 
     memory: ClassVar[tuple[str, ...]] = ()
@@ -293,7 +295,8 @@ def _adopt_class(cls: type) -> type:
     own = {} if hasattr(cls, "couples") else {"couples": True}  # one that does not say may depend on any lane
     names = {"__module__": cls.__module__, "__qualname__": cls.__qualname__, "__doc__": cls.__doc__}
     # with its own way to begin: a dataclass would make one in which a default of `Force` may stand before a field without one
-    return type(cls)(cls.__name__, (cls, Force), own | names | {"__init__": cls.__init__})
+    body = own | names | {"__init__": cls.__init__}
+    return new_class(cls.__name__, (cls, Force), exec_body=lambda namespace: namespace.update(body))
 
 
 def adopt_force(part: Callable) -> Force:

@@ -13,10 +13,11 @@ from physjax.backend import block_fusion
 from physjax.checks import concrete_or_none, unchecked_quantity
 from physjax.particles import Particles, demand_particles
 from physjax.parts import as_module
+from physjax.tracebacks import Module
 from physjax.vectors import add_trailing_axes, components, stack_components
 
 
-class Pins(eqx.Module):
+class Pins(Module):
     """Prescribed motion: `Scene(..., pinned=Pins(nodes, path))` moves the lanes of the mask `nodes` along `path(t)`.
 
     `path(t) -> positions` [m] of all lanes, `(*lanes, dim)` or broadcastable to it; only the rows of `nodes` count.

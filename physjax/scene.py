@@ -51,6 +51,7 @@ from physjax.quantities import (
 )
 from physjax.stages import Stage, advance_force, close_joints, prescribe, resolve_contact
 from physjax.summaries import represent_scene, tabulate_scene
+from physjax.tracebacks import Module
 from physjax.trials import find_faulty_force
 
 
@@ -75,7 +76,7 @@ def project(motion: Callable, scene: "Scene", t: Time, dt: ArrayLike) -> "Scene"
     return scene.replace(state=state)
 
 
-class Scene(eqx.Module):
+class Scene(Module):
     """Everything a run needs but the method: state, mass [kg], forces, contacts, which lanes are held, prescribed or born.
 
     `mass` is a scalar or per lane, an `Inertia` for rigid bodies. `forces` are library forces or any callable

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from physjax.backend import jit_is_disabled
 from physjax.particles import callable_name
 from physjax.parts import Function, holds_user_code
+from physjax.tracebacks import explain_tracer_error
 
 MAX_REMEMBERED_TRIALS = 4096
 """Trials that are remembered; then all are forgotten."""
@@ -58,16 +59,8 @@ def _find_fault(state: PyTree, mass: PyTree, force: Callable) -> str | None:
     try:
         time = jax.ShapeDtypeStruct((), state.dtype)
         jax.eval_shape(lambda t, state, mass: state.evaluate_load(force, t, mass), time, state, mass)
-    except jax.errors.TracerBoolConversionError:
-        return (
-            "decides by a number that is not known yet (`if`, `while`, `and`, `max`).\n"
-            "Write jnp.where(condition, a, b) in place of `if`, & in place of `and`, jnp.maximum in place of max."
-        )
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
-        return (
-            "asks for a number that is not known yet: NumPy and math, float() and int() cannot be given traced ones.\n"
-            "Write jnp.sin in place of np.sin and math.sin, and leave float() and int() out."
-        )
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        return explain_tracer_error(error)
     except TypeError as error:
         text = str(error)
         if not text.startswith("force "):

@@ -6,11 +6,17 @@
 
 import os
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
 # one thread per worker: the workers fill the cores, and threads that spin for each other double the time of the suite
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+if "XLA_FLAGS" not in os.environ:
+    FLAGS = "--xla_cpu_multi_thread_eigen=false"
+    # most of what tests take is compiling: before jax 0.11 the older of two code generators does it in two thirds of the time
+    if tuple(map(int, version("jax").split(".")[:2])) < (0, 11):
+        FLAGS += " --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = FLAGS
 os.environ.setdefault("MPLBACKEND", "Agg")
 # what one file or worker has compiled the others read: a fifth of the time of the suite; kept for this run of it alone
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -29,6 +35,7 @@ with jaxtyping.install_import_hook("physjax", "beartype.beartype"):
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_traceback_filtering", "off")  # whoever mends physjax wants the frames that its users are spared
 
 
 SLOW = {line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#")}

@@ -27,6 +27,19 @@ def test_the_page_is_what_its_results_files_say(load):
     assert report.PAGE.read_text() == report.build_page(report.read_results())
 
 
+def test_the_table_of_speed_is_what_the_newest_results_say(load):
+    table, results = load("speed_table"), load("report").read_results()
+    page = table.README.read_text()
+    assert page == table.replace_speed_table(page, results)
+    shown = page.partition("## Speed")[2].partition("## ")[0]
+    assert shown.count(table.write_speed_table(results)) == 1
+    assert len(re.findall(r"\d", shown.partition(table.BEGIN)[0])) <= 2  # float32: no figure beside the table
+    newest = table.find_newest(results, "aim")["machine"]["when"]
+    assert newest == max(r["machine"]["when"] for r in results.values() if r.get("benchmark") == "aim")
+    faster = {name: dict(r, bars=[dict(bar, measured=7.0) for bar in r.get("bars", [])]) for name, r in results.items()}
+    assert page != table.replace_speed_table(page, faster)
+
+
 def test_every_results_file_that_a_page_names_is_there():
     for page in (ROOT / "README.md", ROOT / "benchmarks" / "README.md"):
         names = re.findall(r"(?:benchmarks/)?results/[\w./-]+\.(?:json|png)", page.read_text())

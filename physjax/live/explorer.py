@@ -21,6 +21,7 @@ from physjax.show.auto_plot import draw_still
 from physjax.show.pages import check_output_path
 from physjax.show.pages import write_page as write_file
 from physjax.show.stills import bundle_page, encode_still
+from physjax.tracebacks import shorten_tracebacks
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -136,6 +137,7 @@ class Explorer:
         return self.widget
 
 
+@shorten_tracebacks
 def explore(
     build: "Callable | str",
     *,

@@ -36,6 +36,7 @@ class LiveServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
+    disable_nagle_algorithm = True  # a film is not held back until the page has confirmed what came before it
     server: LiveServer  # pyright: ignore[reportIncompatibleVariableOverride]  it serves this one alone
 
     def do_GET(self) -> None:

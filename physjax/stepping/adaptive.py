@@ -33,6 +33,7 @@ from physjax.stepping.step_control import (
 )
 from physjax.stepping.system import S, System, leaf_dtype, read_traits
 from physjax.stepping.walk import Course, Walk, begin_walk, walk_on, walk_through
+from physjax.tracebacks import Module, shorten_tracebacks
 from physjax.vectors import add_trailing_axes, norm
 
 MAX_FRAMES_PER_STEP = 64
@@ -56,7 +57,7 @@ class Steps(NamedTuple):
     ok: Bool[Array, "..."]
 
 
-class Adaptive(eqx.Module):
+class Adaptive(Module):
     """A method under error control, made by `adaptive`; `report` also returns the steps it took.
 
     Steps end where a force of the system jumps, and each sees the mean over itself of what jumps within it: the system is
@@ -276,6 +277,7 @@ def _step_with_lateness(scene: Scene, method: Callable, t: Time, dt: Array) -> t
     return scene, late
 
 
+@shorten_tracebacks
 def adaptive(
     method: Callable,
     atol: ArrayLike = 1e-6,

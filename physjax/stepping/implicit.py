@@ -24,6 +24,7 @@ from physjax.stepping.krylov import SolveReport, Vector
 from physjax.stepping.pairs import Attempt
 from physjax.stepping.registry import Promises
 from physjax.stepping.system import S, System, average_over_step, leaf_dtype, push_drift
+from physjax.tracebacks import Module
 from physjax.vectors import scale
 
 DIAGONAL = 1 - 2**0.5 / 2
@@ -34,7 +35,7 @@ ERROR_WEIGHTS = ((4 * WEIGHT - 1) / 3, -1 / 3, 2 * DIAGONAL / 3)
 """TR-BDF2: its weights less those of order 3 on the same slopes (M. E. Hosea and L. F. Shampine 1996)."""
 
 
-class ImplicitMethod(eqx.Module):
+class ImplicitMethod(Module):
     """A method that solves the equation of a stage, once or more often a step: its settings, and how it reports."""
 
     tolerance: float | None = eqx.field(static=True, default=None)

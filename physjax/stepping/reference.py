@@ -16,6 +16,7 @@ from jaxtyping import Array
 from physjax.checks import as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.scene import Scene
+from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def discontinuities(scene: Scene) -> Array:
     return jnp.sort(jnp.concatenate(times)) if times else jnp.zeros(0, scene.state.dtype)
 
 
+@shorten_tracebacks
 @announce_compiling("the reference")
 def reference(
     scene: Scene,

@@ -30,9 +30,11 @@ from physjax.scene import Scene
 from physjax.stepping.frames import Moving, choose_steps
 from physjax.stepping.pairs import Remembering
 from physjax.stepping.sampling import Sampling, sample_frames
+from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory, select_stateful_parts
 
 
+@shorten_tracebacks
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 @announce_compiling("the run")
 def simulate(
@@ -238,6 +240,7 @@ class StateAfter(NamedTuple):
     ok: Bool[Array, "..."]
 
 
+@shorten_tracebacks
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 @announce_compiling("the run")
 def state_after(scene: Scene, method: Callable, *, duration: ArrayLike, dt: ArrayLike) -> StateAfter:

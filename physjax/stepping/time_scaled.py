@@ -22,6 +22,7 @@ from physjax.scene import Scene
 from physjax.stepping.dependence import find_dependent, find_kicked, name_forces_of_velocity
 from physjax.stepping.registry import Promises, read_promises
 from physjax.stepping.system import S, System, average_over_step, leaf_dtype, read_traits
+from physjax.tracebacks import Module, shorten_tracebacks
 
 SHORTEST_STEP_SHARE = 1e-9
 """The shortest step, relative to dt: a pace that asks for shorter ones would never arrive."""
@@ -41,7 +42,7 @@ class ScaledMotion(NamedTuple):
     numbers: Any
 
 
-class TimeScaled(eqx.Module):
+class TimeScaled(Module):
     """A method whose steps follow the pace of the motion, made by `time_scaled`. It remembers its way from dt to dt.
 
     Called as a plain method it forgets it, and starts over at each dt.
@@ -197,6 +198,7 @@ class _Logarithmic(NamedTuple):
         return system.drift(kicked, second), first + second, inverse_pace
 
 
+@shorten_tracebacks
 def time_scaled(method: Callable, pace: Callable | None = None) -> TimeScaled:
     """A symplectic method whose steps are short where the motion is fast, with its energy bounded as with equal steps.
 

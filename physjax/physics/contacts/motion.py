@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
@@ -10,12 +9,13 @@ from jaxtyping import Array, Float
 
 from physjax.checks import OptionalNumbers, demand_direction, quantity
 from physjax.parts import as_module
+from physjax.tracebacks import Module, explain_tracer_error
 from physjax.vectors import broadcast_vector, dot, scale, spin, unit
 
 __all__ = ["Motion"]
 
 
-class Motion(eqx.Module):
+class Motion(Module):
     """The motion of a surface as a function of time: x(t) = P + R(θ(t)) (X - P) + s(t) of each of its points X.
 
     `displacement(t)` is s [m], a vector; `angle(t)` is θ [rad], about the `pivot` P [m], the origin unless given: in the
@@ -86,8 +86,11 @@ class Motion(eqx.Module):
                     with jax.numpy_rank_promotion("allow"):
                         found = jax.eval_shape(function, jax.ShapeDtypeStruct(t, jnp.result_type(float))).shape
                 except (TypeError, ValueError) as error:
+                    words = explain_tracer_error(error)
+                    reason = str(error) if words is None else f"It {words}"
                     raise ValueError(
-                        f"{name}: got a motion whose {what} cannot be called with a time of shape {t}, expected {wanted}. {error}"
+                        f"{name}: got a motion whose {what} cannot be called with a time of shape {t}, "
+                        f"expected {wanted}. {reason}"
                     ) from error
                 if found[-1:] not in ((), (1,), (width,)) or (not found and width > 1):
                     raise ValueError(

@@ -2,20 +2,20 @@
 
 from typing import Any, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import Numbers, concrete_or_none, demand_all, quantity
 from physjax.particles import Particles
+from physjax.tracebacks import Module
 from physjax.vectors import dot, scale
 
 MIN_SLIP_SPEED_SQUARED = 1e-30
 """Slip speed² [m²/s²] below which nothing slips; it keeps the derivative of the square root finite at zero."""
 
 
-class Coulomb(eqx.Module):
+class Coulomb(Module):
     """Dry friction: a contact sticks up to μ_s times the normal impulse or force; beyond, it slips against μ_k times it.
 
     Example:

@@ -7,7 +7,6 @@ as friction or a velocity, is None and absent from the program.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -16,6 +15,7 @@ from jaxtyping import Array
 from physjax.particles import Particles
 from physjax.physics.contacts.face import ContactFace
 from physjax.stacks import Stack, map_stacks, stack_alike, unstack
+from physjax.tracebacks import Module
 from physjax.vectors import scale
 
 
@@ -27,7 +27,7 @@ class Touch(NamedTuple):
     carried: Array | None
 
 
-class Surfaces(eqx.Module):
+class Surfaces(Module):
     """All surfaces of a scene that are resolved at the time of impact, by kind."""
 
     stacks: tuple[Stack, ...]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import Numbers, concrete_or_none, demand_all, quantity
+from physjax.tracebacks import Module
 
 
 class Appearance(NamedTuple):
@@ -24,7 +25,7 @@ class Appearance(NamedTuple):
     opacity: Float[Array, "*lanes"]
 
 
-class Look(eqx.Module):
+class Look(Module):
     """Curves over life: values at equally spaced ages from birth to death, linear between them.
 
     `size` `(knots,)` multiplies the size at birth, `colour` is `(knots, 3)`, `opacity` `(knots,)`. With `glows` the light of

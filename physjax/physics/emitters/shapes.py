@@ -17,10 +17,11 @@ from jaxtyping import Array, Float, Int
 
 from physjax.checks import Numbers, concrete_or_none, demand_all, demand_direction, quantity
 from physjax.loops import force_rounding
+from physjax.tracebacks import Module
 from physjax.vectors import broadcast_vector, components, scale, stack_components, turn_left
 
 
-class Source(eqx.Module):
+class Source(Module):
     """A shape that particles are born from.
 
     Example:

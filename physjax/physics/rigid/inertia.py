@@ -1,7 +1,6 @@
 """Mass, principal moments and axes of the usual solids, of point masses, of closed meshes, and of their composites.
 
-Closed forms may be traced: masses and sizes can be swept and differentiated. A full tensor is diagonalised once, on the
-host and in double precision.
+Closed forms may be traced: masses and sizes can be swept and differentiated. A full tensor is diagonalised once, on the host.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,13 +31,14 @@ from physjax.physics.rigid.planar_inertia import (
     planar_polygon,
     planar_segment,
 )
+from physjax.tracebacks import Module
 from physjax.vectors import components, dot, scale
 
 FLAT_VOLUME_SHARE = 1e-12
 """Share of the tetrahedra's volumes below which their sum is rounding, and a mesh encloses nothing."""
 
 
-class Inertia(eqx.Module):
+class Inertia(Module):
     """Mass [kg] and principal moments of inertia about the center of mass [kg m²]: the `mass=` of a scene of rigid bodies.
 
     `mass` is a scalar or per lane, `principal` `(3,)` or `(*lanes, 3)`, `axes` a quaternion from the principal axes to

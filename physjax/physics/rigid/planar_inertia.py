@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -10,9 +9,10 @@ from jaxtyping import Array
 
 from physjax.checks import NestedArrayLike, Numbers, as_real_quantity, quantity
 from physjax.physics.rigid.polygon_corners import demand_convex_corners
+from physjax.tracebacks import Module
 
 
-class PlanarInertia(eqx.Module):
+class PlanarInertia(Module):
     """Mass [kg] and moment of inertia about the center of mass [kg m²] of bodies in the plane, one for all or per lane.
 
     Example:

@@ -21,6 +21,7 @@ from physjax.study.ablation.variants import Variant, list_pair_variants, list_va
 from physjax.study.stability.limits import check_method
 from physjax.text import format_seconds, format_table
 from physjax.timing import time_in_turn
+from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ class Ablation(NamedTuple):
         return draw_ablation(self, figure)
 
 
+@shorten_tracebacks
 @announce_compiling("ablate")
 def ablate(
     scene: Scene,

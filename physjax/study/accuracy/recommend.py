@@ -40,6 +40,7 @@ from physjax.study.accuracy.search import (
 )
 from physjax.study.problem import Problem
 from physjax.text import progress_bar
+from physjax.tracebacks import shorten_tracebacks
 
 MAX_FINALISTS, FINALIST_TIME_RATIO = 3, 2.0
 """Methods that are verified and timed for an error, by what their runs predict, if at most this many times slower than others."""
@@ -51,6 +52,7 @@ MIN_NUMBERS_FOR_FLOAT32 = 512
 """Numbers in a state below which a run takes as long in either precision, to a tenth (measured with drag on 16 to 8192)."""
 
 
+@shorten_tracebacks
 @announce_compiling("recommend")
 def recommend(
     scene: Scene,

@@ -22,6 +22,7 @@ from physjax.study.accuracy.result import Run, WorkPrecision
 from physjax.study.accuracy.runs import Comparison, run_gradient, run_method, run_rival
 from physjax.study.energy.quantities import Conserved
 from physjax.study.problem import Problem
+from physjax.tracebacks import shorten_tracebacks
 
 if TYPE_CHECKING:
     import diffrax
@@ -36,6 +37,7 @@ HORIZON_ERROR_SHARE = 1e-2
 """Share of the path to which rounding may grow before errors from point to point mean nothing."""
 
 
+@shorten_tracebacks
 @announce_compiling("work_precision")
 def work_precision(
     problem: Problem | Scene,

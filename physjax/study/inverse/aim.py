@@ -40,6 +40,7 @@ from physjax.study.inverse.shooting import (
     select_where,
 )
 from physjax.summaries import Row, format_array, write_grid, write_summary, write_table
+from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory
 from physjax.vectors import components, dot, norm, stack_components
 
@@ -156,6 +157,7 @@ class Aimed(eqx.Module):
         return draw_shots(self, every=every, ax=ax)
 
 
+@shorten_tracebacks
 @jax.transfer_guard("allow")  # what a call is given goes to the device on purpose
 @announce_compiling("aim_at")
 def aim_at(

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from physjax.checks import as_positive_integer, as_real_quantity, concrete_or_none
 from physjax.compiling import announce_compiling
 from physjax.study.inverse.solve import solve
+from physjax.tracebacks import shorten_tracebacks
 
 
 class Fit(NamedTuple):
@@ -32,6 +33,7 @@ class Fit(NamedTuple):
     covariance: Float[Array, "numbers numbers"]
 
 
+@shorten_tracebacks
 @announce_compiling("fit")
 def fit(
     predict: Callable[[PyTree], PyTree],

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from physjax.checks import as_positive_integer, as_real_array, as_real_quantity, concrete_or_none, demand_all
 from physjax.compiling import announce_compiling
 from physjax.summaries import Row, format_array, format_tree, write_summary, write_table
+from physjax.tracebacks import shorten_tracebacks
 
 MAX_NEWTON_STEPS = 8
 """Newton steps at most from where the safe search ended to the last digits."""
@@ -61,6 +62,7 @@ def _describe(found: Solution | Minimum, name: str, size: PyTree) -> list[Row]:
     return [*rows, ("ok", format_array(found.ok))]
 
 
+@shorten_tracebacks
 @announce_compiling("solve")
 def solve(
     residual: Callable[[PyTree], PyTree],
@@ -135,6 +137,7 @@ def _polish_root(
     return inner, largest_residual(inner) <= vanishing
 
 
+@shorten_tracebacks
 @announce_compiling("minimise")
 def minimise(
     cost: Callable[[PyTree], Array],

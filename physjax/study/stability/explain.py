@@ -22,6 +22,7 @@ from physjax.study.stability.limits import growth, limit
 from physjax.study.stability.linearisation import rate_text
 from physjax.study.stability.planar import State, count_substeps
 from physjax.text import format_seconds
+from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory
 
 INSPECTED_FRAMES = 12
@@ -93,6 +94,7 @@ class Explanation(NamedTuple):
         }[self.cause]
 
 
+@shorten_tracebacks
 @announce_compiling("explain")
 def explain(
     run: Trajectory | Scene,

@@ -38,6 +38,7 @@ from physjax.study.stability.step_search import (
     find_limits_by_steps,
 )
 from physjax.text import format_seconds
+from physjax.tracebacks import shorten_tracebacks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,6 +131,7 @@ def region(
         return Region(callable_name(method), z, np.asarray(spectral_radius(check_method(method), jnp.asarray(z))))
 
 
+@shorten_tracebacks
 @announce_compiling("the limit")
 def limit(scene: Scene, method: Callable, at: State | None = None) -> Limit:
     """The largest stable dt of a scene under a method, predicted from its forces about a state (the start, if not given).

@@ -41,11 +41,13 @@ from physjax.study.sweeps.design import Lanes, build_lanes, latin_hypercube, sob
 from physjax.study.sweeps.result import Sweep, load, value_names
 from physjax.study.sweeps.store import Manifest, MemoryStore, Store
 from physjax.text import progress_bar
+from physjax.tracebacks import shorten_tracebacks
 
 BATCH_MEMORY_BYTES = 1 << 30
 """Bytes that batches may take by default; the results themselves come on top where they are kept in memory."""
 
 
+@shorten_tracebacks
 @announce_compiling("the sweep")
 def sweep(
     measure: Callable[..., PyTree],
