@@ -31,6 +31,34 @@ def elsewhere(monkeypatch):
     monkeypatch.setattr(backend, "device_kind", lambda: "gpu")
 
 
+# code generators
+
+
+@ON_CPU
+@pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="there is one generator from jax 0.11 on")
+@pytest.mark.parametrize(
+    ("method", "names"),
+    [(methods.rk4, ("Drag", "Gravity")), (methods.verlet, ("Attraction",)), (methods.implicit_euler, ("Anchor",))],
+    ids=["flight", "stars", "anchors"],
+)
+def test_runs_are_the_same_by_both_code_generators(method, names):
+    """The tests themselves run by the older one, which compiles sooner."""
+    position = jnp.asarray(np.random.default_rng(0).normal(size=(7, 3)))
+    parts = {
+        "Drag": forces.QuadraticDrag(0.3, 0.1, 1.2),
+        "Gravity": forces.Gravity(),
+        "Attraction": forces.Gravitation(1.0, softening=0.1),
+        "Anchor": forces.Anchor((0.0, 1.0, 0.0), 40.0, rest_length=0.5),
+    }
+    scene = Scene(Particles(position, 0.1 * position), forces=tuple(parts[name] for name in names))
+    run = lambda scene: simulate(scene, method, dt=1e-2, steps=50, save_every=50).position[-1]  # noqa: E731
+    older, newer = (
+        jax.jit(run, compiler_options={"xla_cpu_use_fusion_emitters": choice})(scene) for choice in (False, True)
+    )
+    np.testing.assert_allclose(newer, older, rtol=1e-11)
+    assert not np.allclose(newer, position)
+
+
 # what is computed once
 
 

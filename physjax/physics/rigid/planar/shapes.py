@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from physjax.checks import NestedArrayLike, Numbers, as_real_quantity, unchecked_quantity
 from physjax.physics.rigid.polygon_corners import demand_convex_corners
+from physjax.tracebacks import Module
 
 
-class PlanarShape(eqx.Module):
+class PlanarShape(Module):
     """What a body fills: the convex hull of its corners [m], and all that is nearer to it than `radius` [m].
 
     Corners are `(corners, 2)` in the body's frame, about its center of mass, anticlockwise. One corner is a disc, two are a

@@ -102,6 +102,11 @@ class Solids(Contact):
                     else "PlanarShape such as rigid.PlanarShape.box((1, 1))"
                 )
                 raise TypeError(f"Solids: got a {type(shape).__name__}, expected a {example}.")
+        if self.coulomb is not None and not isinstance(self.coulomb, Coulomb):
+            raise TypeError(
+                f"coulomb: got {self.coulomb!r}, expected contacts.Coulomb(static=0.5, kinetic=0.4) for what bodies do to each "
+                "other; a surface has its own."
+            )
         for surface in self.surfaces:
             if not isinstance(surface, Surface):
                 raise TypeError(

@@ -19,11 +19,12 @@ from physjax.physics.rigid.space.polyhedra import (
     find_topology,
     tabulate_polyhedra,
 )
+from physjax.tracebacks import Module
 
 Kind = Literal["sphere", "capsule", "box", "hull"]
 
 
-class Shape(eqx.Module):
+class Shape(Module):
     """What a body in space fills: a box with half edges `half` [m] about its center of mass, and all within a `radius` [m] of it.
 
     A sphere is a point with a radius, a capsule a segment with one; boxes have sharp edges. A hull has `corners` [m] and lies
