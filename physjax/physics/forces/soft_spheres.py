@@ -19,8 +19,8 @@ from physjax.particles import Particles
 from physjax.parts import Force
 from physjax.vectors import root_and_inverse, stack_components
 
-Column = tuple[list[Array], list[Array], Array, Array]
-"""Places [m] and velocities [m/s] by components, radii [m] and masses [kg] of particles, `(*scenes, particles)` each."""
+Column = tuple[list[Array], list[Array], Array, Array, Array]
+"""Places [m] and velocities [m/s] by components, radii [m], masses [kg] and numbers of particles, `(*scenes, particles)` each."""
 
 Term = Callable[[Column, Column], list[Array]]
 """What others contribute to particles, of which the arrays are `(*scenes, particles, 1)` and `(*scenes, 1, others)`."""
@@ -64,8 +64,8 @@ class SoftSpheres(Force):
         return self._sum_over_others(state, mass, self._store)[0]
 
     def _push(self, here: Column, there: Column) -> list[Array]:
-        (x, v, radius, mass), (others, speeds, reach, heavy) = here, there
-        normal, depth = _measure_overlap(x, others, radius, reach)
+        (_, v, _, mass, _), (_, speeds, _, heavy, _) = here, there
+        normal, depth = _measure_overlap(here, there)
         push = self.stiffness * depth
         if self.restitution is not None:
             approach = sum(n * (a - b) for n, a, b in zip(normal, v, speeds, strict=True))
@@ -76,7 +76,7 @@ class SoftSpheres(Force):
         return [-push * n for n in normal]
 
     def _store(self, here: Column, there: Column) -> list[Array]:
-        depth = _measure_overlap(here[0], there[0], here[2], there[2])[1]
+        depth = _measure_overlap(here, there)[1]
         return [0.25 * self.stiffness * depth * depth]
 
     def _sum_over_others(self, state: Particles, mass: Array, term: Term) -> list[Array]:
@@ -87,7 +87,8 @@ class SoftSpheres(Force):
             )
         split = lambda vectors: [vectors[..., i] for i in range(vectors.shape[-1])]  # noqa: E731
         numbers = (jnp.broadcast_to(number, state.lanes) for number in (self.radius, mass))
-        crowd = split(state.position), split(state.velocity), *numbers
+        which = jnp.broadcast_to(jnp.arange(state.lanes[-1], dtype=jnp.int32), state.lanes)
+        crowd = split(state.position), split(state.velocity), *numbers, which
         here = jax.tree.map(lambda part: part[..., :, None], crowd)
         add = lambda there: [  # noqa: E731
             jnp.sum(part, axis=-1) for part in term(here, jax.tree.map(lambda part: part[..., None, :], there))
@@ -97,14 +98,14 @@ class SoftSpheres(Force):
             return add(crowd)
         tiles = -(-count // most)
 
-        def cut(part: Array, filling: float) -> Array:
+        def cut(part: Array, filling: float = 0) -> Array:
             wide = [(0, 0)] * (part.ndim - 1) + [(0, tiles * most - count)]
             filled = jnp.pad(part, wide, constant_values=filling)
             return jnp.moveaxis(filled.reshape(*part.shape[:-1], tiles, most), -2, 0)
 
         # what fills the last tile reaches nobody: its radius is minus infinity
-        x, v, radius, weight = crowd
-        parts = [cut(part, 0.0) for part in x], [cut(part, 0.0) for part in v], cut(radius, -jnp.inf), cut(weight, 1.0)
+        x, v, radius, weight, _ = crowd
+        parts = [*map(cut, x)], [*map(cut, v)], cut(radius, -jnp.inf), cut(weight, 1.0), cut(which)
         none = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), jax.eval_shape(add, crowd))
         # recomputing a tile in reverse mode keeps its memory linear too
         fold = jax.checkpoint(
@@ -113,12 +114,16 @@ class SoftSpheres(Force):
         return lax.scan(fold, none, parts)[0]
 
 
-def _measure_overlap(x: list[Array], others: list[Array], radius: Array, reach: Array) -> tuple[list[Array], Array]:
-    """Unit vectors to others, and how deep they overlap [m]: zero where they do not, as in the same place."""
+def _measure_overlap(here: Column, there: Column) -> tuple[list[Array], Array]:
+    """Unit vectors to others, and how deep they overlap [m]: zero where they do not, as of one with itself.
+
+    That is told by numbers: x - x need not be zero where the compiler computes both in ways of its own.
+    """
+    (x, _, radius, _, own), (others, _, reach, _, number) = here, there
     ways = [b - a for a, b in zip(x, others, strict=True)]
     distance, inverse = root_and_inverse(sum(way * way for way in ways[1:]) + ways[0] * ways[0])
     depth = radius + reach - distance
-    touches = (depth > 0) & (inverse > 0)
+    touches = (depth > 0) & (own != number)
     return [way * inverse for way in ways], jnp.where(touches, depth, 0.0)
 
 
