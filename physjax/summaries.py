@@ -117,13 +117,24 @@ def _format_field(field: dataclasses.Field, value: object) -> str:
     unit = field.metadata.get("unit", "")
     if isinstance(value, bool | int | float | np.number | np.ndarray | jax.Array):
         return f"{field.name}={format_array(value, unit if unit != '1' else '')}"
-    if isinstance(value, str | tuple) and not any(hasattr(item, "shape") for item in value):
+    if isinstance(value, tuple):
+        return f"{field.name}={_format_several(value)}"
+    if isinstance(value, str):
         return f"{field.name}={value!r}"
     if callable(value) and hasattr(value, "__name__"):
         return f"{field.name}={value.__name__}"
     if dataclasses.is_dataclass(value):
         return f"{field.name}={format_part(value)}"
     return f"{field.name}={value!r}"
+
+
+def _format_several(parts: tuple) -> str:
+    """A few parts, or the first and the last of many and how many there are."""
+    shown = parts if len(parts) <= ENTRIES_SHOWN else (parts[0], parts[-1])
+    texts = [format_array(part) if isinstance(part, np.ndarray | jax.Array) else format_part(part) for part in shown]
+    if len(parts) > ENTRIES_SHOWN:
+        return f"({texts[0]}, …, {texts[1]}; {len(parts)} of them)"
+    return f"({', '.join(texts)}{',' if len(texts) == 1 else ''})"
 
 
 def describe_scene(scene: Any) -> tuple[str, list[Row]]:

@@ -1,10 +1,13 @@
-"""A ragdoll whose joints hold exactly and turn no farther than a body's do; metres, x to its left, y up, z forward."""
+"""Ragdolls, whose joints hold exactly and turn no farther than a body's do; metres, x to its left, y up, z forward."""
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from physjax.physics import forces, rigid
+from physjax.physics import contacts, forces, rigid
 from physjax.physics.rigid import inertia
 from physjax.scene import Scene
 from physjax.scenes.registry import scene
@@ -45,18 +48,33 @@ HINGES = (
 )
 SPIN = (1.0, 1.5, 0.0)
 """Its angular velocity at the start [rad/s]."""
+STEPS, RISE, TREAD, WIDTH = 5, 0.2, 0.35, 3.0
+"""Steps of the stairs, and their height, depth and width [m]."""
 BEND = 2.4
 """By how much elbows and knees bend [rad]; they do not bend the other way."""
 
 
-@scene
-def hung_ragdoll(g: float = 9.8) -> Problem:
-    """A ragdoll of eleven limbs falls with its arms spread, held by one hand, and dangles: no joint opens or turns too far."""
+class _Doll(NamedTuple):
+    """What a ragdoll is made of: its limbs, the middles of these [m], its joints, and what each limb looks like."""
+
+    limbs: inertia.Inertia
+    middle: np.ndarray
+    sockets: rigid.Joints
+    hinges: rigid.Hinges
+    looks: list[solids.Shape]
+
+    @property
+    def pairs(self) -> set[tuple[int, int]]:
+        """The limbs that are joined."""
+        return {(int(a), int(b)) for joints in (self.sockets, self.hinges) for a, b in joints.pairs}
+
+
+def _build_doll() -> _Doll:
     names = list(LIMBS)
     mass, radius, length, axis, middle = zip(*LIMBS.values(), strict=True)
-    shapes = zip(mass, radius, length, axis, strict=True)
-    moments = [inertia.capsule(*limb, axis=along).principal for *limb, along in shapes]
-    limbs = inertia.Inertia(np.array(mass), jnp.stack(moments))
+    moments = [
+        inertia.capsule(*limb, axis=along).principal for *limb, along in zip(mass, radius, length, axis, strict=True)
+    ]
     middle = np.array(middle)
     place = lambda pairs, points: np.array(points)[:, None] - middle[pairs]  # noqa: E731
     number = lambda joints: np.array([[names.index(name) for name in joint[:2]] for joint in joints])  # noqa: E731
@@ -66,32 +84,80 @@ def hung_ragdoll(g: float = 9.8) -> Problem:
     _, _, points, axes = zip(*HINGES, strict=True)
     pairs = number(HINGES)
     hinges = rigid.Hinges(pairs, place(pairs, points), axis=axes, limits=(0.0, BEND))
-    hand = np.array([0.8, 1.44, 0.0])
-    held = names.index("left forearm")
-    grip = rigid.Joints([(-1, held)], [[hand, hand - middle[held]]])
-    # turning as a whole about the hand, so that no limb stays in the plane of the others
-    start = rigid.bodies(limbs, middle, velocity=np.cross(SPIN, middle - hand), angular_velocity=SPIN)
-    hung = Scene(start, limbs, (forces.Gravity(g), sockets, hinges, grip))
+    looks = [solids.capsule(*limb, axis=along) for *limb, along in zip(radius, length, axis, strict=True)]
+    return _Doll(inertia.Inertia(np.array(mass), jnp.stack(moments)), middle, sockets, hinges, looks)
 
-    def see(flight: Trajectory, measure) -> np.ndarray:
-        return np.asarray(jax.vmap(measure)(jax.tree.map(jnp.asarray, flight.state)))
+
+def _see(flight: Trajectory, measure: Callable) -> np.ndarray:
+    return np.asarray(jax.vmap(measure)(jax.tree.map(jnp.asarray, flight.state)))
+
+
+def _judge(doll: _Doll, played: Scene, most: float) -> tuple[Truth, ...]:
+    """That no joint opens or turns too far, and that the whole gains no more energy in a frame than lifts it by `most` [m]."""
 
     def exceed(flight: Trajectory) -> np.ndarray:
-        angle = see(flight, hinges.angle)
+        angle = _see(flight, doll.hinges.angle)
         return np.maximum(angle - BEND, -angle).clip(0.0)
 
     def gain(flight: Trajectory) -> np.ndarray:
-        stored = np.asarray(jax.vmap(lambda t, s: energy.total(hung, t, s))(flight.time, flight.state))
-        return np.diff(stored).clip(0.0) / (np.sum(mass) * g)
+        stored = np.asarray(jax.vmap(lambda t, s: energy.total(played, t, s))(flight.time, flight.state))
+        return np.diff(stored).clip(0.0) / (np.sum(doll.limbs.mass) * 9.8)
 
-    return Problem(
-        hung,
-        duration=3.0,
-        truths=(
-            Truth("no joint opens [m]", lambda f: see(f, sockets.error), 0.0, 1e-9),
-            Truth("elbows and knees bend one way alone, and no farther than they can [rad]", exceed, 0.0, 1e-3),
-            Truth("limits take energy and give none [m]", gain, 0.0, 1e-2),
-        ),
-        looks=[solids.capsule(*limb, axis=along) for *limb, along in zip(radius, length, axis, strict=True)],
-        frames=24,
+    return (
+        Truth("no joint opens [m]", lambda f: _see(f, doll.sockets.error), 0.0, 1e-9),
+        Truth("elbows and knees bend one way alone, and no farther than they can [rad]", exceed, 0.0, 1e-3),
+        Truth("limits and hits take energy and give none [m]", gain, 0.0, most),
     )
+
+
+@scene
+def hung_ragdoll(g: float = 9.8) -> Problem:
+    """A ragdoll of eleven limbs falls with its arms spread, held by one hand, and dangles: no joint opens or turns too far."""
+    doll = _build_doll()
+    hand = np.array([0.8, 1.44, 0.0])
+    held = list(LIMBS).index("left forearm")
+    grip = rigid.Joints([(-1, held)], [[hand, hand - doll.middle[held]]])
+    # turning as a whole about the hand, so that no limb stays in the plane of the others
+    start = rigid.bodies(doll.limbs, doll.middle, velocity=np.cross(SPIN, doll.middle - hand), angular_velocity=SPIN)
+    hung = Scene(start, doll.limbs, (forces.Gravity(g), doll.sockets, doll.hinges, grip))
+    return Problem(hung, duration=3.0, truths=_judge(doll, hung, 1e-2), looks=doll.looks, frames=24)
+
+
+@scene
+def thrown_ragdoll(g: float = 9.8) -> Problem:
+    """A ragdoll is thrown down five stairs, head over heels: no joint opens, and no limb goes through a step."""
+    doll, count = _build_doll(), len(LIMBS)
+    heights = RISE * np.arange(STEPS, 0, -1)
+    steps = np.stack([np.zeros(STEPS), heights / 2, TREAD * np.arange(STEPS)], axis=1)
+    place = np.concatenate([doll.middle + np.array([0.0, heights[0] + 0.1, 0.0]), steps])
+    mass = np.append(doll.limbs.mass, np.ones(STEPS))
+    bodies = inertia.Inertia(mass, jnp.concatenate([doll.limbs.principal, jnp.ones((STEPS, 3))]))
+    spin, velocity = np.zeros_like(place), np.zeros_like(place)
+    spin[:count] = 1.5, 0.2, 0.0
+    velocity[:count] = np.array([0.3, 0.0, 1.2]) + np.cross(spin[0], place[:count] - place[0])
+    capsules = [rigid.Shape.capsule(radius, length, axis=axis) for _, radius, length, axis, _ in LIMBS.values()]
+    boxes = [rigid.Shape.box((WIDTH, height, TREAD)) for height in heights]
+    rough = contacts.Coulomb(0.5, 0.5)
+    ground = contacts.Plane((0.0, 0.0, 0.0), (0.0, 1.0, 0.0), restitution=0.0, coulomb=rough)
+    pairs = [(limb, count + step) for limb in range(count) for step in range(STEPS)]
+    stairs = rigid.Solids([*capsules, *boxes], (ground,), coulomb=rough, pairs=pairs)
+    fall = Scene(
+        rigid.bodies(bodies, place, velocity=velocity, angular_velocity=spin),
+        bodies,
+        (forces.Gravity(g), doll.sockets, doll.hinges),
+        (stairs,),
+        pinned=np.arange(count + STEPS) >= count,
+    )
+
+    def sink(flight: Trajectory) -> np.ndarray:
+        """How far the middles of limbs are nearer to the tread below them than their radius [m]."""
+        x, y, z = np.moveaxis(np.asarray(flight.position)[:, :count], -1, 0)
+        step = np.floor(z / TREAD + 0.5).clip(0, STEPS).astype(int)
+        tread = np.append(heights, 0.0)[step]
+        radius = np.array([limb[1] for limb in LIMBS.values()])
+        beside = np.abs(x) < WIDTH / 2
+        return np.where(beside, radius - (y - tread), 0.0).clip(0.0)
+
+    truths = (*_judge(doll, fall, 1e-2), Truth("limbs lie on the steps [m]", sink, 0.0, 1e-2))
+    looks = [*doll.looks, *(solids.box((WIDTH, height, TREAD)) for height in heights)]
+    return Problem(fall, duration=2.4, truths=truths, looks=looks, frames=16)

@@ -16,6 +16,7 @@ from physjax.stepping import methods
 from physjax.stepping.reference import cast_floats, reference
 from physjax.stepping.simulate import simulate
 from physjax.study.energy.quantities import Conserved
+from physjax.summaries import count, describe_scene, format_number, write_summary
 from physjax.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -59,6 +60,15 @@ class Problem(NamedTuple):
     frames: int = 32
     looks: "physjax.show.drawables.Look | None" = None
     name: str = ""
+
+    def __repr__(self) -> str:
+        """The scene, how long it takes, and what is known about it."""
+        title, rows = describe_scene(self.scene)
+        known = [("exact", "in closed form")] if self.exact is not None else []
+        known += [("kept", conserved.name) for conserved in self.conserved]
+        known += [("truth", truth.statement) for truth in self.truths]
+        time = ("duration", f"{format_number(self.duration)} s, {count(self.frames, 'frame')}")
+        return write_summary(f"{self.name or 'Problem'}: {title}", [*rows, time, *known])
 
     @property
     def times(self) -> np.ndarray:

@@ -16,6 +16,7 @@ SLOW = (
     "chain_bridge",
     "crane",
     "hung_ragdoll",
+    "thrown_ragdoll",
     "motor_car",
     "triple_pendulum",
     "tumbling_box",

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from physjax.checks import NestedArrayLike, Numbers, as_real_quantity, unchecked_quantity
 from physjax.physics.rigid.polygon_corners import demand_convex_corners
+from physjax.summaries import represent_part
 from physjax.tracebacks import Module
 
 
@@ -25,6 +26,8 @@ class PlanarShape(Module):
 
     corners: Float[Array, "corners 2"] = unchecked_quantity("corners", "m", per=None)
     radius: Numbers = unchecked_quantity("radius", "m", per=None, at_least=0)
+
+    __repr__ = represent_part
 
     @classmethod
     def disc(cls, radius: float | Array) -> "PlanarShape":

@@ -19,6 +19,7 @@ from physjax.physics.rigid.space.polyhedra import (
     find_topology,
     tabulate_polyhedra,
 )
+from physjax.summaries import represent_part
 from physjax.tracebacks import Module
 
 Kind = Literal["sphere", "capsule", "box", "hull"]
@@ -40,6 +41,8 @@ class Shape(Module):
     radius: Numbers = unchecked_quantity("radius", "m", per=None, at_least=0)
     corners: Float[Array, "corners 3"] | None = unchecked_quantity("corners", "m", per=None, default=None)
     topology: Topology | None = eqx.field(static=True, default=None, repr=False)
+
+    __repr__ = represent_part
 
     @classmethod
     def sphere(cls, radius: float | Array) -> "Shape":
