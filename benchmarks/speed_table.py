@@ -49,7 +49,7 @@ def write_speed_table(results: Mapping[str, Mapping]) -> str:
             f"{_format(boxes['physjax'])} million steps/s",
             f"MuJoCo MJX {boxes['MJX']:.2f}",
         ),
-        (f"boxes in {worlds} stacks of four, with friction", f"{speed} million steps/s", ""),
+        (f"boxes in {worlds} stacks of ten, with friction, four sub-steps", f"{speed} million steps/s", ""),
         (
             f"both arcs to {_group(aim['settings']['targets'])} targets, float64",
             f"{arcs['aim_at: seconds for all targets, both arcs']:.2f} s",

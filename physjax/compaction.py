@@ -1,4 +1,4 @@
-"""Only the lanes that are flagged are computed, gathered in groups or in windows, so that the work follows their number."""
+"""How many lanes are computed together: those that are flagged, in groups or windows, or a tile of worlds after another."""
 
 import math
 from collections.abc import Callable

@@ -68,7 +68,7 @@ class Problem(NamedTuple):
         known += [("kept", conserved.name) for conserved in self.conserved]
         known += [("truth", truth.statement) for truth in self.truths]
         time = ("duration", f"{format_number(self.duration)} s, {count(self.frames, 'frame')}")
-        return write_summary(f"{self.name or 'Problem'}: {title}", [*rows, time, *known])
+        return write_summary(f"{self.name or 'Problem'}: {title.removeprefix('Scene: ')}", [*rows, time, *known])
 
     @property
     def times(self) -> np.ndarray:

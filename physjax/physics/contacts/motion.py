@@ -1,4 +1,4 @@
-"""How a surface is led: as a rigid body, along a path and about an axis, both functions of time."""
+"""How a surface is driven: as a rigid body, along a path and about an axis, both functions of time."""
 
 from collections.abc import Callable
 

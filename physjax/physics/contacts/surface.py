@@ -44,7 +44,7 @@ class Surface(Contact):
     What turns within itself has an `angular_velocity` Ω [rad/s], a vector in space and a number in the plane (> 0:
     anticlockwise): friction then sees velocity + Ω×r, with r from the axis. The axis goes through the point of a plane or
     slab, along its normal (a turntable), and through the center of a sphere (a drum, a ball that spins); that of a shape
-    of your own, which must be round about it, goes through `axis_point`. What is led along a path or about an axis, as
+    of your own, which must be round about it, goes through `axis_point`. What is driven along a path or about an axis, as
     functions of time, has a `motion` instead.
 
     A shape of your own is a subclass with a `signed_distance(t, position)` and nothing else: its normal and curvature

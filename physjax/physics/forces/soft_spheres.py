@@ -117,7 +117,7 @@ class SoftSpheres(Force):
 def _measure_overlap(here: Column, there: Column) -> tuple[list[Array], Array]:
     """Unit vectors to others, and how deep they overlap [m]: zero where they do not, as of one with itself.
 
-    That is told by numbers: x - x need not be zero where the compiler computes both in ways of its own.
+    Particles are compared by number: x - x need not be zero, since a compiler may round each x in its own way.
     """
     (x, _, radius, _, own), (others, _, reach, _, number) = here, there
     ways = [b - a for a, b in zip(x, others, strict=True)]

@@ -1,6 +1,6 @@
 """Mass, principal moments and axes of the usual solids, of point masses, of closed meshes, and of their composites.
 
-Closed forms may be traced: masses and sizes can be swept and differentiated. A full tensor is diagonalised once, on the host.
+Closed forms may be traced, swept and differentiated. A full tensor is diagonalised once, on the host in double precision.
 """
 
 from collections.abc import Iterable, Sequence

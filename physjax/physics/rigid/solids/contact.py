@@ -34,7 +34,7 @@ class Solids(Contact):
 
     `shapes` is one for all bodies, or a sequence with one for each in the last lane axis: `rigid.PlanarShape` in the plane,
     `rigid.Shape` in space. `surfaces` are those of `contacts`, with a restitution and friction of their own; they may turn
-    within themselves (turntables, drums) and be led as functions of time (shaken tables, lifts, tumblers). Between bodies
+    within themselves (turntables, drums) and be driven by functions of time (shaken tables, lifts, tumblers). Between bodies
     it is the mean of the two where `restitution` is given for each. `pairs`, `(pairs, 2)`, lists those that can touch:
     without, all pairs, of up to 64 bodies.
 

@@ -82,7 +82,7 @@ class Touching(NamedTuple):
     """Contacts in groups, the gap of each point [m], and the points [m] by components, `(points, groups, size, worlds)`.
 
     `carried` of the contacts is how surfaces move in the mean of a sub-step, `carried_at_end` at its end: None where none
-    turns or is led.
+    turns or is driven.
     """
 
     contacts: Any

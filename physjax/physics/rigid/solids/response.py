@@ -163,9 +163,9 @@ def _hold_apart(
     each, rubbing = by_world(h[0], gap[0]), mechanics.rubbing
 
     def sweep(this: _Pass, carried: tuple[Array, ...] | None) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
-        start, led = world.pad_all(this.velocity), contacts if carried is None else contacts._replace(carried=carried)
-        after, pressed = sweep_contacts(mechanics, start, world.groups, led, this.demand, this.impulses)
-        opening = measure_openings(mechanics, after, world.groups, led)
+        start, seen = world.pad_all(this.velocity), contacts if carried is None else contacts._replace(carried=carried)
+        after, pressed = sweep_contacts(mechanics, start, world.groups, seen, this.demand, this.impulses)
+        opening = measure_openings(mechanics, after, world.groups, seen)
         cases = zip(contacts.is_point, pressed[rubbing:], gap, opening, strict=True)
         touches = tuple(is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
         after = world.cut_all(after)

@@ -1,4 +1,4 @@
-"""How surfaces that turn, or are led as functions of time, move where bodies touch them.
+"""How surfaces that turn, or are driven by functions of time, move where bodies touch them.
 
 What sticks to such a surface must end a sub-step where the surface has gone: so the velocity for the places after it is
 that of the surface halfway, at the place that the point in contact has reached by then, and the velocity for the end is

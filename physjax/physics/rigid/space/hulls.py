@@ -65,8 +65,7 @@ def find_hull_manifolds(t: ArrayLike, a: Hulls, b: Hulls) -> Manifold:
     pick = lambda edge, face: jnp.where(axis.of_edges[None], edge[None], face)  # noqa: E731
     points = tuple(pick(edge, face) for edge, face in zip(point, by_face.points, strict=True))
     ways = jnp.stack(choose(axis.of_edges, normal, by_face.normal))
-    spread = tuple(part[:, None] for part in frame.axes)
-    placed = add(put_in_front(frame.origin), combine(jnp.stack(points), (spread[0], spread[1], spread[2])))
+    placed = frame.place_several(jnp.stack(points))
     return Manifold(combine(ways, frame.axes), placed, pick(gap, by_face.gaps), axis.of_edges | by_face.is_point)
 
 
@@ -260,12 +259,18 @@ def clip_ways(
     each = lambda part: part[:, None]  # noqa: E731
     inside = dp[None] * (each(v) - q[None]) - dq[None] * (each(u) - p[None])
     rate = dp[None] * each(dv) - dq[None] * each(du)
-    reach = SIDE_SHARE * length * length
-    flat = abs(rate) <= SIDE_SHARE * reach
-    crossing = -(inside + reach) / jnp.where(flat, 1.0, rate)
-    never = flat & (inside < -reach)
-    enters = jnp.max(jnp.where(~flat & (rate > 0), crossing, jnp.where(never, 2.0, 0.0)), axis=1)
-    leaves = jnp.min(jnp.where(~flat & (rate < 0), crossing, jnp.where(never, -1.0, 1.0)), axis=1)
+    return find_inside(inside + SIDE_SHARE * length * length, rate, axis=1)
+
+
+def find_inside(begin: Array, rate: Array, axis: int) -> tuple[Array, Array]:
+    """The shares of ways at which they enter and leave, 0 to 1, where no number along an axis is below zero.
+
+    Each number is `begin` at the start of a way and changes at a `rate`. What is nowhere inside leaves before it enters.
+    """
+    crossing = -begin / jnp.where(rate == 0, 1.0, rate)
+    never = (rate == 0) & (begin < 0)
+    enters = jnp.max(jnp.where(rate > 0, crossing, jnp.where(never, 2.0, 0.0)), axis=axis)
+    leaves = jnp.min(jnp.where(rate < 0, crossing, jnp.where(never, -1.0, 1.0)), axis=axis)
     return jnp.maximum(enters, 0.0), jnp.minimum(leaves, 1.0)
 
 
@@ -300,6 +305,7 @@ __all__ = [
     "Hulls",
     "clip_ways",
     "find_hull_manifolds",
+    "find_inside",
     "find_nearest",
     "lift",
     "lift_vector",

@@ -51,6 +51,11 @@ class Frame(NamedTuple):
         """A point of the frame in the world [m]."""
         return add(self.origin, combine(numbers, self.axes))
 
+    def place_several(self, numbers: Array) -> Vector:
+        """Several points of the frame in the world [m], `(3, points, ...)`."""
+        x, y, z = (part[:, None] for part in self.axes)
+        return add(put_in_front(self.origin), combine(numbers, (x, y, z)))
+
 
 def see_direction(axes: Vector, vector: Vector) -> Array:
     """How much of a vector is along each of some axes, which are in front."""

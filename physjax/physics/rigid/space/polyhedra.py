@@ -70,7 +70,7 @@ def find_topology(corners: np.ndarray) -> tuple[np.ndarray, Topology]:
         if heights.max() <= ROUNDING * size:
             normals.setdefault(frozenset(np.flatnonzero(heights >= -ROUNDING * size).tolist()), normal)
     if len(normals) < 4:
-        raise ValueError("hull: got points in one plane, expected some out of it: a hull is a solid.")
+        raise ValueError("Shape.hull: got points in one plane, expected some out of it: a hull is a solid.")
     faces = [_go_round(corners, np.array(sorted(members)), normal) for members, normal in normals.items()]
     # a point that lies on an edge or within a face is no corner
     kept = sorted({number for face in faces for number in face})

@@ -25,7 +25,7 @@ from physjax.physics.rigid.space.components import (
     take_part,
     take_vector,
 )
-from physjax.physics.rigid.space.hulls import Hulls, find_nearest, lift_vector
+from physjax.physics.rigid.space.hulls import Hulls, find_inside, find_nearest, lift_vector
 from physjax.physics.rigid.space.manifolds import POINTS, Boxes, Frame, Manifold, see_direction
 from physjax.physics.rigid.space.polyhedra import Polyhedra
 
@@ -54,9 +54,8 @@ def find_round_manifolds(t: ArrayLike, hull: Hulls, other: Boxes) -> Manifold:
     flat, plane = store(lambda: (_lies_flat(own, face, normal), take_part(face, own.heights)))
     above = sum_parts([n[None] * part for n, part in zip(normal, points, strict=True)]) - plane[None]
     gaps = jnp.where(flat[None], above, nearest.distance[None]) - other.radius[None]
-    x, y, z = (part - (other.radius[None] + gaps / 2) * n[None] for part, n in zip(points, normal, strict=True))
-    spread = tuple(part[:, None] for part in frame.axes)
-    placed = add(put_in_front(frame.origin), combine(jnp.stack([x, y, z]), (spread[0], spread[1], spread[2])))
+    middle = [part - (other.radius[None] + gaps / 2) * n[None] for part, n in zip(points, normal, strict=True)]
+    placed = frame.place_several(jnp.stack(middle))
     twice = lambda part: jnp.concatenate([part] * (POINTS // 2))  # noqa: E731
     found = twice(placed[0]), twice(placed[1]), twice(placed[2])
     return Manifold(combine(jnp.stack(normal), frame.axes), found, twice(gaps), jnp.ones(flat.shape, bool))
@@ -95,12 +94,8 @@ def _find_nearest(own: Polyhedra, start: Vector, way: Vector) -> _Nearest:
         normal = choose(nearer, take_vector(face, own.normals), normal)
     first, last = _stand(own, start), _stand(own, add(start, way))
     depth, face = find_best(jnp.minimum(first, last))
-    rate = last - first
-    crossing = -first / jnp.where(rate == 0, 1.0, rate)
-    never = (rate == 0) & (first > 0)
-    enters = jnp.max(jnp.where(rate < 0, crossing, jnp.where(never, 2.0, 0.0)), axis=0)
-    leaves = jnp.min(jnp.where(rate > 0, crossing, jnp.where(never, -1.0, 1.0)), axis=0)
-    inside = (jnp.maximum(enters, 0.0) <= jnp.minimum(leaves, 1.0)) | (distance <= 0)
+    enters, leaves = find_inside(-first, first - last, axis=0)
+    inside = (enters <= leaves) | (distance <= 0)
     lower = jnp.where(take_part(face, first) <= take_part(face, last), shares[0], shares[1])
     return _Nearest(
         choose(inside, take_vector(face, own.normals), normal),
@@ -143,11 +138,8 @@ def _prefer_faces(own: Polyhedra, start: Vector, way: Vector, nearest: _Nearest)
     polygon = x[None], y[None], z[None]
     lies = out[0][None], out[1][None], out[2][None]
     begin, end = (_measure_within(polygon, lies, place)[0] for place in (start, add(start, way)))
-    rate, reach = end - begin, SIDE_SHARE * (dot(way, way) + own.heights[0] ** 2)[None]
-    crossing = -(begin + reach) / jnp.where(rate == 0, 1.0, rate)
-    never = (rate == 0) & (begin < -reach)
-    enters = jnp.maximum(jnp.max(jnp.where(rate > 0, crossing, jnp.where(never, 2.0, 0.0)), axis=0), 0.0)
-    leaves = jnp.minimum(jnp.min(jnp.where(rate < 0, crossing, jnp.where(never, -1.0, 1.0)), axis=0), 1.0)
+    reach = SIDE_SHARE * (dot(way, way) + own.heights[0] ** 2)[None]
+    enters, leaves = find_inside(begin + reach, end - begin, axis=0)
     two = flat & (enters <= leaves)
     shares = [jnp.where(two, edge, nearest.share) for edge in (enters, leaves)]
     return choose(flat, out, nearest.normal), jnp.stack(shares)

@@ -15,10 +15,8 @@ from jaxtyping import Array
 from physjax.backend import materialise
 from physjax.physics.rigid.space.boxes import clip_way
 from physjax.physics.rigid.space.components import (
-    add,
     combine,
     find_sign,
-    put_in_front,
     square_root,
     sum_parts,
     take_part,
@@ -61,8 +59,7 @@ def find_segment_manifolds(t: ArrayLike, box: Boxes, other: Boxes, has_sides: bo
     heights = sum_parts(direction * (point - below))
     gaps = heights - (box.radius + other.radius)[None]
     middle = point - (other.radius[None] + gaps / 2)[None] * direction
-    axes = tuple(part[:, None] for part in frame.axes)
-    placed = add(put_in_front(frame.origin), combine(middle, (axes[0], axes[1], axes[2])))
+    placed = frame.place_several(middle)
     twice = lambda part: jnp.concatenate([part] * (POINTS // 2))  # noqa: E731
     points = twice(placed[0]), twice(placed[1]), twice(placed[2])
     return Manifold(combine(normal, frame.axes), points, twice(gaps), jnp.ones(apart.shape, bool))

@@ -15,7 +15,6 @@ from physjax.physics.rigid.space.boxes import AROUND
 from physjax.physics.rigid.space.components import (
     Vector,
     add,
-    combine,
     find_best,
     find_sign,
     put_in_front,
@@ -92,9 +91,7 @@ def _list_corners(t: ArrayLike, solids: _Solids, normal: Vector) -> Vector:
         return corners
     rows, polyhedra = hulls
     frame, way = _pick_frames(boxes, rows), (normal[0][rows], normal[1][rows], normal[2][rows])
-    own = pick_face_corners(t, polyhedra, see_direction(frame.axes, way))
-    spread = tuple(part[:, None] for part in frame.axes)
-    placed = add(put_in_front(frame.origin), combine(jnp.stack(own), (spread[0], spread[1], spread[2])))
+    placed = frame.place_several(jnp.stack(pick_face_corners(t, polyhedra, see_direction(frame.axes, way))))
     x, y, z = (_replace_rows(part, rows, other) for part, other in zip(corners, placed, strict=True))
     return x, y, z
 

@@ -1,4 +1,4 @@
-"""Solids on surfaces that turn or are led: what sticks goes where the surface goes, at its velocity."""
+"""Solids on surfaces that turn or are driven: what sticks goes where the surface goes, at its velocity."""
 
 import equinox as eqx
 import jax
