@@ -30,8 +30,8 @@ def test_charts_count_the_orientation_among_the_errors():
     assert study.observed_order("euler") == pytest.approx(1, abs=0.15)  # a path without forces is exact: turning is not
 
 
-def test_what_cannot_be_asked_of_bodies_yet_says_so():
+def test_modes_of_what_turns_in_space_cannot_be_asked_for_yet():
     scene = SCENES["free_top"]().scene
-    for ask in (lambda: stability.limit(scene, methods.rk4), lambda: stability.explain(scene, methods.rk4, 0.1)):
-        with pytest.raises(TypeError, match="RigidBodies, expected Particles"):
-            ask()
+    assert "set by the spin of a body" in str(stability.limit(scene, methods.rk4))
+    with pytest.raises(TypeError, match="RigidBodies, expected Particles"):
+        stability.explain(scene, methods.rk4, 0.1)
