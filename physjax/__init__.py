@@ -57,7 +57,7 @@ Folders carry the names of the public namespaces, and imports point down only: `
 (what you ask of a scene), `show` (what you look at), then `physics` and `stepping` next to each other, then the nouns
 (`scene.py`, `trajectory.py`, `particles.py`, ...), then `kernels` and `components` (a step rewritten for a GPU), then the ground.
 Physics does not know how it is stepped; stepping does not know what acts. State and results are `NamedTuple`s; a scene, a
-force, a contact is an `equinox.Module`; everything else is a function. `backend.py` is the only place that knows what the
+force, a contact is an `equinox.Module`; everything else is a function. `backend.py` and `xla_options.py` alone know what the
 compiler needs on each device. `physjax.stepping` follows dt through a step, `physjax.physics` follows the value of a force.
 
 Every name has an example that runs after these lines: a shot, its flight, an oscillator, a flag, a tumbling brick, a
@@ -99,6 +99,9 @@ from physjax.stepping import methods
 from physjax.stepping.reference import ode_term, reference
 from physjax.stepping.simulate import simulate, state_after
 from physjax.trajectory import Trajectory
+from physjax.xla_options import ask_for_loop_emitter
+
+ask_for_loop_emitter()
 
 if TYPE_CHECKING:
     from physjax import projectile, scenes, show, study

@@ -1,5 +1,7 @@
 """The one place that knows the compiler and the device: what XLA needs to run physics fast that is written without it.
 
+What the compiler is asked for is in `xla_options`.
+
 Each policy has its reason and its measurement next to it. CPU figures are of two cores with AVX-512 and jax 0.10.1 or
 0.12, unless they say otherwise.
 
@@ -10,15 +12,12 @@ Each policy has its reason and its measurement next to it. CPU figures are of tw
 - How many steps are a kernel: `choose_unrolled_steps`, `runs_as_kernel`, `choose_kernel_shape`.
 - How much is computed at once: `choose_group_lanes`, `count_lane_blocks`, `choose_block_lanes`, `choose_block_targets`,
   `choose_pair_kernel`, `choose_tile_sources`.
-- What the compiler is asked for: `jit_untransformed`.
 - Which clock a search goes by, and how a device is called: `read_work_clock`, `device_kind`, `describe_device`.
 """
 
-import functools
 import math
 import platform
 import time
-import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib.util import find_spec
@@ -77,20 +76,6 @@ PAIR_TARGETS, PAIR_SOURCES, PAIR_WARPS, PAIR_PROGRAMS = 64, 32, 4, 1024
 """Targets and sources in a tile of that kernel, 16 pairs for each thread; warps that share it; how many tiles fill a card."""
 MIN_BODIES_FOR_KERNEL = 256
 """With fewer bodies a reduction stores less than a card's cache holds."""
-WIDE_VECTOR_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
-"""XLA fills half of an AVX-512 register unless asked for more, which makes a step 1.4 to 1.5 times faster."""
-OLDER_EMITTER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
-"""Timed contacts are many small kernels, over which the emitters of jax 0.10 take twice the compile time of the older ones.
-
-From jax 0.11 on there are no others, and the option is gone.
-"""
-COMMAND_BUFFER_OPTIONS = {
-    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUSTOM_CALL,WHILE,CONDITIONAL", "xla_gpu_graph_min_graph_size": 1
-}  # fmt: skip
-"""Loops and branches are recorded with the kernels in them, so that a card goes through them without asking the host.
-
-On an H200 a bounce of one ball takes half the time (270 to 125 µs a step), a car's step 0.63 of it (710 to 445 µs).
-"""
 
 
 @runtime_checkable
@@ -362,39 +347,3 @@ def choose_pair_kernel(bodies: int) -> PairKernel | None:
 def choose_tile_sources(bodies: int) -> int:
     """How many sources are in a tile of a sum that is folded over tiles."""
     return SOURCES_PER_TILE if on_cpu() else max(SOURCES_PER_TILE, PAIRS_PER_TILE // bodies)
-
-
-# what the compiler is asked for
-
-
-def jit_untransformed(
-    function: Callable[..., T], device: Device | None = None, *, many_small_kernels: bool = False, **options: Any
-) -> Callable[..., T]:
-    """`jax.jit(function, **options)` with what makes a program fast on a device, the default one unless given.
-
-    For functions that no `jit`, `vmap` or `grad` is around: XLA's options belong to a whole program, and JAX refuses
-    them inside of another. An option that the installed compiler does not know is left out with a warning.
-    `many_small_kernels` asks for what compiles those sooner.
-    """
-    kind = device_kind() if device is None else device.platform
-    wanted: dict[str, int | bool | str] = {"cpu": WIDE_VECTOR_OPTIONS, "gpu": COMMAND_BUFFER_OPTIONS}.get(kind, {})
-    if kind == "cpu" and many_small_kernels and jax.__version_info__ < (0, 11):
-        wanted = wanted | OLDER_EMITTER_OPTIONS
-    known = {name: value for name, value in wanted.items() if _is_known_option(name, value)}
-    return jax.jit(function, compiler_options=known or None, **options)
-
-
-@functools.cache
-def _is_known_option(name: str, value: int | bool | str) -> bool:
-    """Whether the compiler takes an option, found once by compiling a program without operations (15 ms)."""
-    try:
-        probe = jax.jit(lambda x: x, compiler_options={name: value})
-        probe.lower(jax.ShapeDtypeStruct((), jnp.float32)).compile()
-    except jax.errors.JaxRuntimeError as error:
-        warnings.warn(
-            f"jax {jax.__version__} does not take the compiler option {name}={value}: {error}. Runs are as right without "
-            "it, but may be slower.",
-            stacklevel=2,
-        )
-        return False
-    return True

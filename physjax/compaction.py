@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
 from physjax.backend import GROUPS_PER_SCENE, any_lane, choose_group_lanes, on_cpu
+from physjax.loops import open_closure
 
 WORLDS_PER_GROUP = 32
 """Worlds that are swept at a time, where only some have impacts."""
@@ -82,30 +83,96 @@ def compact_and_apply(
     lanes, total = flag.shape, flag.size
     size = choose_group_lanes(total) if cut else None
     if size is None:
+        function = jax.checkpoint(function)
         return lax.cond(any_lane(flag), lambda: function(changing, *others), lambda: changing)
     by_lane = lambda leaf: leaf.reshape((total, *leaf.shape[len(lanes) :]))  # noqa: E731
-    flat = jax.tree.map(by_lane, changing)
+    flat, flags = jax.tree.map(by_lane, changing), jax.tree.leaves(masks)
+    leaves, structure = jax.tree.flatten(others)
+    own = [by_lane(leaf) for leaf, has_lanes in zip(leaves, flags, strict=True) if has_lanes]
+
+    def call(now: T, few: list) -> T:
+        some = iter(few)
+        cut = [next(some) if has_lanes else leaf for leaf, has_lanes in zip(leaves, flags, strict=True)]
+        return function(now, *structure.unflatten(cut))
+
+    few = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((size, *leaf.shape[1:]), leaf.dtype), (flat, own))
+    opened, known = open_closure(call, *few)
+    groups = _Groups(opened, size)
     words, upto = _pack_flags(flag.ravel())
 
-    def apply_to_group(now, first):
-        index = _find_flagged_lanes(words, upto, first + jnp.arange(size, dtype=jnp.int32))
-        pick = lambda leaf: leaf.at[index].get(mode="clip")  # noqa: E731
-        few = jax.tree.map(lambda a, has_lanes: pick(by_lane(a)) if has_lanes else a, others, masks)
-        done = function(jax.tree.map(pick, now), *few)
-        # beyond the last flagged lane there is none, and nothing is written
-        return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop"), now, done)
+    @jax.custom_jvp
+    def run(known, flat, own, words, upto):
+        return groups.apply_in_place(known, flat, own, (words, upto))
 
-    def apply_to_groups(now, first):
-        apply = lambda now, first: (  # noqa: E731
-            lax.cond(any_lane(first < upto[-1]), lambda: apply_to_group(now, first), lambda: now),
-            None,
-        )
-        return lax.scan(apply, now, first)[0]
+    @run.defjvp
+    def push(given, changes):
+        apply = lambda known, flat, own, words, upto: groups.apply_at_once(known, flat, own, (words, upto))  # noqa: E731
+        return jax.jvp(apply, given, changes)
 
-    firsts = jnp.arange(0, total, size, dtype=jnp.int32)
-    end = apply_to_groups(flat, firsts[:1])
-    end = lax.cond(any_lane(upto[-1] > size), lambda: apply_to_groups(end, firsts[1:]), lambda: end)
-    return jax.tree.map(lambda a, was: a.reshape(was.shape), end, changing)
+    flat = run(known, flat, own, words, upto)
+    return jax.tree.map(lambda a, was: a.reshape(was.shape), flat, changing)
+
+
+class _Groups(NamedTuple):
+    """Flagged lanes in groups of a size, and what is computed of one, with what it closes over in front."""
+
+    function: Callable[..., PyTree]
+    size: int
+
+    def number(self, flat: PyTree) -> Array:
+        """The numbers of flagged lanes, a row for each group."""
+        total = len(jax.tree.leaves(flat)[0])
+        return jnp.arange(-(-total // self.size) * self.size, dtype=jnp.int32).reshape(-1, self.size)
+
+    def apply_in_place(self, known: list, flat: T, own: list, packed: tuple[Array, Array]) -> T:
+        """The arrays with one group after the other written into them."""
+        words, upto = packed
+
+        def apply_to_group(flat, numbers):
+            index = _find_flagged_lanes(words, upto, numbers)
+            return _put(flat, index, self.function(known, *_pick((flat, own), index)))
+
+        def apply(flat, numbers):
+            applies = any_lane(numbers[0] < upto[-1])
+            return lax.cond(applies, lambda: apply_to_group(flat, numbers), lambda: flat), None
+
+        numbers = self.number(flat)
+        flat, _ = apply(flat, numbers[0])
+        more = lambda: lax.scan(apply, flat, numbers[1:])[0]  # noqa: E731
+        return lax.cond(any_lane(upto[-1] > self.size), more, lambda: flat)
+
+    def apply_at_once(self, known: list, flat: T, own: list, packed: tuple[Array, Array]) -> T:
+        """The same with derivatives: all groups are picked before and written after.
+
+        A loop that does it adds up derivatives of all lanes in every turn. Reverse mode computes a group again: zeros in place
+        of what others would have stored cost more than the work.
+        """
+        words, upto = packed
+        compute = jax.checkpoint(self.function)
+
+        def apply_to_groups(flat, numbers):
+            index = _find_flagged_lanes(words, upto, numbers)
+
+            def apply(_, group):
+                first, now, few = group
+                return None, lax.cond(any_lane(first < upto[-1]), lambda: compute(known, now, few), lambda: now)
+
+            return _put(flat, index, lax.scan(apply, None, (numbers[:, 0], *_pick((flat, own), index)))[1])
+
+        numbers = self.number(flat)
+        flat = apply_to_groups(flat, numbers[:1])
+        more = jax.checkpoint(partial(apply_to_groups, numbers=numbers[1:]))
+        return lax.cond(any_lane(upto[-1] > self.size), more, lambda flat: flat, flat)
+
+
+def _pick(tree: T, index: Array) -> T:
+    """Some lanes of arrays; an index beyond the last is the last."""
+    return jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), tree)
+
+
+def _put(flat: T, index: Array, done: T) -> T:
+    """The arrays with what was done to some lanes; an index beyond the last is none."""
+    return jax.tree.map(lambda a, b: a.at[index].set(b, mode="drop", unique_indices=True), flat, done)
 
 
 def compact_and_apply_runs(
@@ -148,7 +215,7 @@ def _pack_flags(flag: Bool[Array, "lanes"]) -> tuple[Array, Array]:
 
 
 def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
-    """The lanes of the flags with these numbers, counted from zero; at least the number of lanes where there are fewer flags."""
+    """The lanes of the flags with these numbers, counted from zero; different ones beyond all where there are fewer."""
     word = jnp.searchsorted(upto, number + 1, method="scan_unrolled").astype(jnp.int32)
     left = words.at[word].get(mode="clip")
     rank = number - upto.at[word].get(mode="clip") + lax.population_count(left).astype(jnp.int32)
@@ -159,7 +226,7 @@ def _find_flagged_lanes(words: Array, upto: Array, number: Array) -> Array:
         rank = rank - jnp.where(above, below, 0)
         place = place + jnp.where(above, width, 0)
         left = jnp.where(above, left >> width, left)
-    return jnp.where(word < words.size, place * words.size + word, 32 * words.size)
+    return jnp.where(word < words.size, place * words.size + word, 32 * words.size + number)
 
 
 def write_entries(table: Array, place: Int[Array, "*lanes"], entries: Array) -> Array:

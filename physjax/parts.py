@@ -249,6 +249,10 @@ class Contact(Module):
         """Polygons `(corners, 3)` [m] that show the surface in a box in space; None: they follow from the signed distance."""
         return None
 
+    def find_loads(self) -> Array | None:
+        """What it exerted on the bodies in the mean of the last step, `(*lanes, freedoms)` [N, N m], where it knows."""
+        return None
+
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
         """The contact with the memory of some lanes cleared, because other particles take their place."""
         return self

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from physjax import Particles, Scene, backend, compaction, forces, loops, methods, simulate
+from physjax import Particles, Scene, backend, compaction, forces, loops, methods, simulate, xla_options
 from physjax.backend import (
     LANES_PER_BLOCK,
     MAX_BATCH_LANES,
@@ -234,10 +234,10 @@ def test_a_sweeps_block_fits_a_cpus_cache_and_fills_anything_else(unannotated):
 @pytest.fixture
 def unknown_option(monkeypatch):
     """An option that no compiler has among those that a run asks for."""
-    monkeypatch.setattr(backend, "WIDE_VECTOR_OPTIONS", {"xla_no_such_option": 1})
-    backend._is_known_option.cache_clear()
+    monkeypatch.setattr(xla_options, "WIDE_VECTOR_OPTIONS", {"xla_no_such_option": 1})
+    xla_options._is_known_option.cache_clear()
     yield
-    backend._is_known_option.cache_clear()
+    xla_options._is_known_option.cache_clear()
 
 
 @ON_CPU
@@ -252,20 +252,20 @@ def test_an_unknown_option_stops_no_run_and_is_said_once(unknown_option, monkeyp
     assert bool(jnp.isfinite(end.position).all())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert backend.jit_untransformed(jnp.sin)(0.3) == jnp.sin(0.3)
+        assert xla_options.jit_untransformed(jnp.sin)(0.3) == jnp.sin(0.3)
 
 
 @ON_CPU
 def test_the_compiler_takes_the_options_that_runs_ask_for():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert backend.jit_untransformed(jnp.sin, many_small_kernels=True)(0.3) == jnp.sin(0.3)
+        assert xla_options.jit_untransformed(jnp.sin, many_small_kernels=True)(0.3) == jnp.sin(0.3)
 
 
 def test_elsewhere_no_option_of_a_cpu_is_asked_for(unknown_option, unannotated):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        backend.jit_untransformed(jnp.sin, SimpleNamespace(platform="gpu"))
+        xla_options.jit_untransformed(jnp.sin, SimpleNamespace(platform="gpu"))
 
 
 # which clock
@@ -282,3 +282,19 @@ def test_waiting_for_another_device_counts(elsewhere):
     began = backend.read_work_clock()
     time.sleep(0.05)
     assert backend.read_work_clock() - began >= 0.04
+
+
+@pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="a fault of jax 0.10")
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (None, xla_options.LOOP_EMITTER_FLAG),
+        ("--xla_dump_to=x", f"--xla_dump_to=x {xla_options.LOOP_EMITTER_FLAG}"),
+        ("--xla_backend_extra_options=other", "--xla_backend_extra_options=other"),
+    ],
+)
+def test_the_loop_emitter_is_asked_for_unless_such_options_are_given(before, after):
+    environment = {} if before is None else {"XLA_FLAGS": before}
+    xla_options.ask_for_loop_emitter(environment)
+    xla_options.ask_for_loop_emitter(environment)
+    assert environment == {"XLA_FLAGS": after}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from physjax import Particles, Scene, backend, contacts, forces, inertia, methods, rigid, simulate
+from physjax import Particles, Scene, backend, contacts, forces, inertia, methods, rigid, simulate, xla_options
 from physjax.checks import quantity
 from physjax.kernels import LaneKernel
 from physjax.parts import Force
@@ -27,7 +27,7 @@ def as_if_on_a_gpu():
     """The policies of a GPU, on the CPU: kernels run in Pallas' interpreter, options that only a card has are left out."""
     gpu = mock.patch.object(backend, "device_kind", return_value="gpu")
     loop._get_standalone_run.cache_clear()
-    with gpu, mock.patch.object(backend, "COMMAND_BUFFER_OPTIONS", {}):
+    with gpu, mock.patch.object(xla_options, "COMMAND_BUFFER_OPTIONS", {}):
         yield
     loop._get_standalone_run.cache_clear()
 

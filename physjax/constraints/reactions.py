@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from physjax.constraints.constraint import Constraint
-from physjax.constraints.coordinates import Places
+from physjax.constraints.coordinates import Places, put_worlds_last
 from physjax.constraints.mechanism import Jacobian, Mechanism, hold_rows
 from physjax.constraints.ranges import Range, Rows, Steps, are_held, change_steps
 from physjax.loops import Time, open_closure, to_float_time
@@ -85,7 +85,7 @@ def constraint_forces(scene: PyTree, t: ArrayLike = 0.0, state: PyTree = None) -
 
     Of a rod the force along it [N], positive where it pulls; of a ball joint the force on its first body; generally λ of
     Jᵀλ, in newtons for rows in metres and in N m for rows in radians, such that it acts on the first body as the row's
-    gap shrinks.
+    gap shrinks. With what `rigid.Solids` exerted on the bodies in the mean of the last step; without it in another `state`.
 
     Example:
         >>> hung = Scene(Particles(jnp.array([[0.0, -1.0]]), jnp.zeros((1, 2))), 2.0,
@@ -93,14 +93,21 @@ def constraint_forces(scene: PyTree, t: ArrayLike = 0.0, state: PyTree = None) -
         >>> print(constraint_forces(hung)[0].ravel())
         [19.6]
     """
-    return find_forces(scene, t, scene.state if state is None else state)
+    if state is None:
+        return find_forces(scene, t, scene.state)
+    free = tuple(contact for contact in scene.contacts if contact.find_loads() is None)
+    return find_forces(scene.replace(contacts=free), t, state)
 
 
 @jax.jit
 def find_forces(scene: PyTree, t: ArrayLike, state: PyTree) -> tuple[Array, ...]:
     """What `constraint_forces` returns, compiled."""
     mechanism, state = _at_moment(scene, t, state)
-    _, λ = _find_multipliers(mechanism, scene, state, _rate_without_joints(scene, t, state))
+    rate = _rate_without_joints(scene, t, state)
+    for loads in (contact.find_loads() for contact in scene.contacts):
+        if loads is not None:
+            rate = mechanism.coordinates.push(rate, scene.mass, put_worlds_last(loads, state.lanes))
+    _, λ = _find_multipliers(mechanism, scene, state, rate)
     found, begun = [], 0
     for part in mechanism.parts:
         own = -λ[: part.rows, begun : begun + len(part.pairs)]

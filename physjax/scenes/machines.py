@@ -102,7 +102,7 @@ def motor_car(torque: float = 120.0, speed: float = 30.0, friction: float = 0.9,
         truths=(
             Truth("gathers speed at 2τ/r over its mass and that of its wheels' turning [m/s]", pace, 0.0, 0.02),
             Truth("its axles stay where they are [m]", lambda f: np.asarray(_measure_axles(f)), 0.0, 1e-6),
-            Truth("stays on the road [m]", lambda f: f.position[:, 1:, 1] - radius, 0.0, 2e-3),
+            Truth("stays on the road [m]", lambda f: f.position[:, 1:, 1] - radius, 0.0, 1e-4),
         ),
         frames=24,
     )

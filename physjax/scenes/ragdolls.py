@@ -158,6 +158,6 @@ def thrown_ragdoll(g: float = 9.8) -> Problem:
         beside = np.abs(x) < WIDTH / 2
         return np.where(beside, radius - (y - tread), 0.0).clip(0.0)
 
-    truths = (*_judge(doll, fall, 1e-2), Truth("limbs lie on the steps [m]", sink, 0.0, 1e-2))
+    truths = (*_judge(doll, fall, 1e-2), Truth("limbs lie on the steps [m]", sink, 0.0, 1e-3))
     looks = [*doll.looks, *(solids.box((WIDTH, height, TREAD)) for height in heights)]
     return Problem(fall, duration=2.4, truths=truths, looks=looks, frames=16)

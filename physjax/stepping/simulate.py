@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import jit_untransformed, runs_as_kernel, split_compilation
+from physjax.backend import runs_as_kernel, split_compilation
 from physjax.checks import as_positive_integer, as_real_argument, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
@@ -32,6 +32,7 @@ from physjax.stepping.pairs import Remembering
 from physjax.stepping.sampling import Sampling, sample_frames
 from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory, select_stateful_parts
+from physjax.xla_options import jit_untransformed
 
 
 @shorten_tracebacks

@@ -4,7 +4,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, emitters, forces, inertia, methods, rigid, simulate, springs
+from physjax import (
+    Particles,
+    Scene,
+    constraint_forces,
+    contacts,
+    emitters,
+    forces,
+    inertia,
+    methods,
+    rigid,
+    simulate,
+    springs,
+)
 from physjax.show.lines import take_lines
 
 G = 9.8
@@ -94,3 +106,45 @@ def test_strengths_that_do_not_fit_are_refused():
         springs.Rods([(0, 1)], breaks_at=0.0)
     with pytest.raises(ValueError, match="springs do not break"):
         rigid.Joints([(0, 1)], jnp.zeros((1, 2, 3)), 1.0, breaks_at=1.0)
+
+
+def rest_a_box_on_a_beam(drop, breaks_at=None):
+    """A beam of two welded planks of 2 kg on two pins 2 m apart, and a box of 10 kg above it, 0.8 m from the first."""
+    plank, box = inertia.planar_plate(2.0, (1.0, 0.1)), inertia.planar_plate(10.0, (0.4, 0.4))
+    bodies = rigid.PlanarInertia(
+        jnp.stack([plank.mass, plank.mass, box.mass]), jnp.stack([plank.moment, plank.moment, box.moment])
+    )
+    pins = rigid.Joints([(-1, 0), (1, -1)], [[[0.0, 0.0], [-0.5, 0.0]], [[0.5, 0.0], [2.0, 0.0]]], breaks_at=breaks_at)
+    weld = rigid.Welds([(0, 1)], [[[0.5, 0.0], [-0.5, 0.0]]])
+    shapes = [rigid.PlanarShape.box((1.0, 0.1))] * 2 + [rigid.PlanarShape.box((0.4, 0.4))]
+    solids = rigid.Solids(shapes, coulomb=contacts.Coulomb(0.5, 0.5), pairs=[(0, 2), (1, 2)])
+    start = rigid.planar_bodies(bodies, [[0.5, 0.0], [1.5, 0.0], [0.8, 0.25 + drop]])
+    return Scene(start, bodies, (forces.Gravity(9.8), pins, weld), (solids,))
+
+
+def test_joints_carry_what_lies_on_the_bodies():
+    film = simulate(rest_a_box_on_a_beam(0.0), methods.leapfrog, dt=1 / 60, steps=60)
+    pins, weld = constraint_forces(film.final_scene)
+    np.testing.assert_allclose(pins, [[0.0, -78.4], [0.0, 58.8]], atol=1e-6)
+    np.testing.assert_allclose(weld, [[0.0, 39.2, 49.0]], atol=1e-6)
+
+
+def test_a_hit_breaks_joints_that_hold_the_same_box_at_rest():
+    for drop, holds in ((0.0, True), (1.0, False)):
+        film = simulate(rest_a_box_on_a_beam(drop, 100.0), methods.leapfrog, dt=1 / 60, steps=60)
+        assert (np.asarray(film.final_scene.forces[1].unbroken) == holds).all()
+        assert (film.position[-1, 0, 1] > -0.01) == holds
+
+
+def test_joints_in_space_carry_what_lies_on_the_bodies():
+    plank, box = inertia.box(2.0, (1.0, 0.4, 0.1)), inertia.box(10.0, (0.3, 0.3, 0.3))
+    bodies = inertia.Inertia(np.array([2.0, 10.0]), np.stack([plank.principal, box.principal]))
+    weld = rigid.Welds([(-1, 0)], [[[0.0, 0.0, 0.0], [-0.5, 0.0, 0.0]]])
+    shapes = [rigid.Shape.box((1.0, 0.4, 0.1)), rigid.Shape.box((0.3, 0.3, 0.3))]
+    solids = rigid.Solids(shapes, coulomb=contacts.Coulomb(0.5, 0.5))
+    start = rigid.bodies(bodies, [[0.5, 0.0, 0.0], [0.6, 0.03, 0.2]])
+    scene = Scene(start, bodies, (forces.Gravity(9.8, up=2), weld), (solids,))
+    film = simulate(scene, methods.leapfrog, dt=1 / 60, steps=60)
+    ((found,),) = constraint_forces(film.final_scene)
+    # of the box the force 98 N at (0.6, 0.03), of the plank 19.6 N in its middle
+    np.testing.assert_allclose(np.abs(found), [0, 0, 117.6, 98 * 0.03, 98 * 0.6 + 19.6 * 0.5, 0], atol=1e-5)

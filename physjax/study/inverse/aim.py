@@ -19,7 +19,6 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from physjax.backend import jit_untransformed
 from physjax.checks import as_real_quantity
 from physjax.compiling import announce_compiling
 from physjax.cubics import Cubic
@@ -43,6 +42,7 @@ from physjax.summaries import Row, format_array, write_grid, write_summary, writ
 from physjax.tracebacks import shorten_tracebacks
 from physjax.trajectory import Trajectory
 from physjax.vectors import components, dot, norm, stack_components
+from physjax.xla_options import jit_untransformed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,10 +22,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, PyTree
 
-from physjax.backend import MAX_BATCH_LANES, choose_block_lanes, jit_untransformed
+from physjax.backend import MAX_BATCH_LANES, choose_block_lanes
 from physjax.study.sweeps.design import KeyPath, leaf_name
 from physjax.study.sweeps.fingerprint import HostCall, find_host_calls, list_inner_jaxprs, persistent_digest
 from physjax.trajectory import Trajectory
+from physjax.xla_options import jit_untransformed
 
 FAILURE_TEXTS = {
     "Run": "blew up: the run's state is not finite at its end",

@@ -6,6 +6,7 @@ acts along one line, and the normal at each point.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
@@ -13,11 +14,23 @@ from jaxtyping import Array
 
 from physjax.backend import materialise
 from physjax.physics.rigid.planar.manifolds import Vector
-from physjax.physics.rigid.solids.mechanics import ALTERNATIONS, SOFT, Demand, Impulses, Points, Sides, Speeds, Velocity
+from physjax.physics.rigid.solids.mechanics import (
+    ALTERNATIONS,
+    SOFT,
+    Demand,
+    Impulses,
+    Points,
+    Sides,
+    Speeds,
+    Spread,
+    Velocity,
+)
 
 MIN_DETERMINANT_SHARE = 1e-3
 """Share of the product of its diagonal below which the matrix of two points has none: they are as good as one."""
 
+COUPLED = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""The directions of each number in `Contacts.coupling`."""
 Both = tuple[Array, Array]
 """The same number at both points of each contact."""
 Directions = tuple[Array, Array, Array]
@@ -62,11 +75,22 @@ def build_contacts(
     ta, tb = torque = materialise(t, lambda: (turn(*arm[0]), turn(*arm[1])))
     along, across = carried[0] * nx + carried[1] * ny, carried[1] * nx - carried[0] * ny
     mass, (ia, ib) = bodies
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
     parallel = lambda i, j: 0.0 if (i == 0) != (j == 0) else mass[0] + mass[1]  # noqa: E731
-    coupling = tuple(parallel(i, j) + ia * ta[i] * ta[j] + ib * tb[i] * tb[j] for i, j in pairs)
+    coupling = tuple(parallel(i, j) + ia * ta[i] * ta[j] + ib * tb[i] * tb[j] for i, j in COUPLED)
     points = (is_point[0], is_point[1])
     return Contacts(normal, torque, (across, along), coupling, mass, (ia, ib), friction, points)
+
+
+def link(contacts: Contacts, spread: Spread) -> Contacts:
+    """Contacts of bodies whose velocities impulses change as `spread` says, all of them in groups."""
+    still = contacts._replace(carried=tuple(map(jnp.zeros_like, contacts.carried)))
+    none = jnp.zeros_like(contacts.coupling[0])
+
+    def respond(impulse: Array) -> Speeds:
+        return find_speeds(spread(find_changes(contacts, tuple(none + part for part in impulse))), still)
+
+    found = jax.vmap(respond)(jnp.eye(3, dtype=none.dtype))
+    return contacts._replace(coupling=tuple(found[i][j] for i, j in COUPLED))
 
 
 def find_speeds(ends: tuple[Velocity, Velocity], contacts: Contacts) -> Directions:
@@ -133,4 +157,4 @@ def _press_both(matrix: list[Array], wanted: Both, yields: Points, there: list[A
     )
 
 
-__all__ = ["Contacts", "build_contacts", "find_changes", "find_speeds", "solve_contact"]
+__all__ = ["Contacts", "build_contacts", "find_changes", "find_speeds", "link", "solve_contact"]

@@ -22,6 +22,7 @@ from physjax.physics.rigid.solids.mechanics import (
     Pose,
     Sides,
     Speeds,
+    Spread,
     Touching,
     Velocity,
     map_components,
@@ -35,6 +36,7 @@ class PlanarMechanics(Mechanics):
     """Places and velocities are along x, y and anticlockwise; impulses along the tangent and the normal at both points."""
 
     remembered = 3
+    freedoms = 3
     rubbing = 1
     straight = 2
 
@@ -79,6 +81,15 @@ class PlanarMechanics(Mechanics):
     def find_contacts(self, world: World, place: tuple[Array, ...], t: ArrayLike) -> Touching:
         """All contacts of bodies at these places: of pairs, then with each surface."""
         return find_contacts(world, place, t)
+
+    def link(self, contacts: Contacts, spread: Spread) -> Contacts:
+        """All contacts, of bodies that move otherwise than alone where impulses change the velocities of both."""
+        return impulses_of_contacts.link(contacts, spread)
+
+    def free(self, contacts: Contacts) -> Contacts:
+        """All contacts, of bodies whose masses and moments are one."""
+        one = jnp.ones_like(contacts.friction)
+        return contacts._replace(mass=(one, one), moment=(one, one))
 
     def find_speeds(self, ends: tuple[Velocity, Velocity], contacts: Contacts) -> Speeds:
         """How fast b moves away from a along the tangent, and along the normal at both points [m/s]."""

@@ -54,6 +54,13 @@ class Solids(Contact):
     energy. A box or hull touches curved surfaces with the corners of a face and the point next to them. What is not convex
     is several bodies held together by `rigid.Welds`.
 
+    Bodies in exact joints move as these let them where a contact pushes one of them: light wheels carry a heavy car, and what is
+    welded together bounces as one body. Limits and motors answer a contact in the next sub-step.
+
+    It remembers the `impulses` of contacts, `(*worlds, numbers, groups, size)`, with which the next step begins, and where
+    bodies are joined the `loads` of contacts on each of them in the mean of the last step, `(*worlds, bodies, 3 or 6)`, force [N]
+    and torque about the center of mass [N m]: what joints carry of these is in `constraint_forces`, and may break them.
+
     Example:
         >>> crate, floor = inertia.planar_plate(2.0, (1.0, 1.0)), contacts.Plane((0.0, 0.0), (0.0, 1.0), restitution=0.0)
         >>> solids = rigid.Solids(rigid.PlanarShape.box((1.0, 1.0)), surfaces=(floor,))
@@ -65,7 +72,7 @@ class Solids(Contact):
     """
 
     couples: ClassVar[bool] = True
-    memory: ClassVar[tuple[str, ...]] = ("impulses",)
+    memory: ClassVar[tuple[str, ...]] = ("impulses", "loads")
     shapes: tuple[PlanarShape | Shape, ...]
     surfaces: tuple[Surface, ...]
     coulomb: Coulomb | None
@@ -73,6 +80,7 @@ class Solids(Contact):
     substeps: int = eqx.field(static=True)
     restitution: Numbers = quantity("restitution K_r", "1", per=None, at_least=0, at_most=1, default=0.0)
     impulses: Array | None = unchecked_quantity("impulses", "N s", per="memory", default=None)
+    loads: Array | None = unchecked_quantity("loads", "N or N m", per="memory", default=None)
 
     def __init__(
         self,
@@ -90,7 +98,7 @@ class Solids(Contact):
         self.coulomb = coulomb
         self.pairs = None if pairs is None else _as_tuples(np.asarray(pairs))
         self.substeps = as_positive_integer("substeps", substeps)
-        self.impulses = None
+        self.impulses = self.loads = None
 
     def __check_init__(self):
         in_space = bool(self.shapes) and isinstance(self.shapes[0], Shape)
@@ -170,6 +178,10 @@ class Solids(Contact):
                 f"Solids: got restitution of shape {self.restitution.shape}, expected () or {state.lanes[-1:]}."
             )
 
+    def find_loads(self) -> Array | None:
+        """What contacts exerted on the bodies in the mean of the last step, zero where none are joined."""
+        return self.loads
+
     def prepare(self, state: Any, couples: bool) -> "Solids":
         """The contact with its pairs listed and no impulses yet."""
         for surface in self.surfaces:
@@ -181,7 +193,9 @@ class Solids(Contact):
         none = jnp.zeros((*state.lanes[:-1], self.mechanics.remembered, *groups.contact.shape), state.dtype)
         parts = self.shapes, self.surfaces, self.restitution, self.coulomb
         listed = Solids(*parts, pairs=pairs, substeps=self.substeps)
-        return eqx.tree_at(lambda solids: solids.impulses, listed, none, is_leaf=lambda leaf: leaf is None)
+        loads = jnp.zeros((*state.lanes, self.mechanics.freedoms), state.dtype)
+        where = lambda solids: (solids.impulses, solids.loads)  # noqa: E731
+        return eqx.tree_at(where, listed, (none, loads), is_leaf=lambda leaf: leaf is None)
 
 
 def _as_tuples(pairs: np.ndarray) -> tuple[tuple[int, int], ...]:

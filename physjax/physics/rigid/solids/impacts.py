@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from physjax.compaction import choose_group_worlds
 from physjax.loops import differentiable_while_loop
+from physjax.physics.rigid.solids.links import Links, Response
 from physjax.physics.rigid.solids.mechanics import (
     Demand,
     Impulses,
@@ -60,16 +61,23 @@ class Bouncing(NamedTuple):
 class _Scene(NamedTuple):
     contacts: Any
     bouncing: Bouncing
+    response: Response | None
+
+    def find_links(self, all_worlds: Links | None) -> Links | None:
+        """How joints answer in these worlds."""
+        return None if all_worlds is None or self.response is None else all_worlds._replace(response=self.response)
 
 
 class _Round(NamedTuple):
     """How far the round of each world is: what its sweeps have brought about, and what they are asked for.
 
     `speeds` are those with which the points have to part, and `active` says which; `round` and `sweep` are their numbers.
+    `total` are the impulses of all rounds.
     """
 
     velocity: Velocity
     impulses: Impulses
+    total: Impulses
     speeds: Points
     active: Points
     round: Array
@@ -83,25 +91,26 @@ def resolve_impacts(
     groups: Groups,
     contacts: Any,
     bouncing: Bouncing,
-) -> Velocity:
-    """Velocities of all rows after the impacts; `openings` are the speeds of separation of all points before [m/s].
+    links: Links | None,
+) -> tuple[Velocity, Impulses]:
+    """Velocities of all rows after the impacts, and their impulses.
 
+    `openings` are the speeds of separation of all points before [m/s].
     Of `bodies` the impulses only tell what those of contacts look like: there are none before.
 
     One loop over sweeps, in which each world begins its next round when its sweeps have converged. Of many worlds only
     those are swept that still bounce, some at a time: most have come to an end when the last has hundreds to go.
     """
-    (velocity, held), scene = bodies, _Scene(contacts, bouncing)
+    (velocity, held), scene = bodies, _Scene(contacts, bouncing, None if links is None else links.response)
     worlds = velocity[0].shape[-1]
     zero = jnp.zeros(worlds, jnp.int32)
     still = jax.tree.map(jnp.zeros_like, held)
-    start = _Round(velocity, still, *_find_demand(mechanics, scene, velocity, openings), zero, zero)
+    start = _Round(velocity, still, still, *_find_demand(mechanics, scene, velocity, openings), zero, zero)
     some = choose_group_worlds(worlds)
     if some is None:
-        sweep = partial(_sweep, mechanics, groups, scene)
-        return differentiable_while_loop(
-            _is_going, sweep, start, most=MAX_SWEEPS_WITH_DERIVATIVES, lanes_last=True
-        ).velocity
+        sweep = partial(_sweep, mechanics, groups, links, scene)
+        end = differentiable_while_loop(_is_going, sweep, start, most=MAX_SWEEPS_WITH_DERIVATIVES, lanes_last=True)
+        return end.velocity, end.total
 
     def sweep_some(all_worlds: _Round) -> _Round:
         index = jnp.argsort(~_is_going(all_worlds), stable=True)[:some]
@@ -109,13 +118,14 @@ def resolve_impacts(
         few, scene_of_few = jax.tree.map(pick, (all_worlds, scene))
         begun = few, jnp.zeros(some, jnp.int32)
         going = lambda turn: _is_going(turn[0]) & (turn[1] < SWEEPS_AT_A_TIME)  # noqa: E731
-        sweep = lambda turn: (_sweep(mechanics, groups, scene_of_few, turn[0]), turn[1] + 1)  # noqa: E731
+        sweep = lambda turn: (_sweep(mechanics, groups, links, scene_of_few, turn[0]), turn[1] + 1)  # noqa: E731
         few, _ = differentiable_while_loop(going, sweep, begun, most=SWEEPS_AT_A_TIME, lanes_last=True)
         write = lambda leaf, new: leaf.at[..., index].set(new, unique_indices=True)  # noqa: E731
         return jax.tree.map(write, all_worlds, few)
 
     most = MAX_SWEEPS_WITH_DERIVATIVES // SWEEPS_AT_A_TIME * -(-worlds // some)
-    return differentiable_while_loop(_is_going, sweep_some, start, most=most, lanes_last=True).velocity
+    end = differentiable_while_loop(_is_going, sweep_some, start, most=most, lanes_last=True)
+    return end.velocity, end.total
 
 
 def _is_going(this: _Round) -> Array:
@@ -125,7 +135,7 @@ def _is_going(this: _Round) -> Array:
 
 def _find_demand(mechanics: Mechanics, scene: _Scene, velocity: Velocity, openings: Points) -> tuple[Points, Points]:
     """What the next round asks for: the speeds after it, and of which points; of none in worlds that have what is asked."""
-    contacts, bouncing = scene
+    contacts, bouncing, _ = scene
     restitution, found = jax.vmap(mechanics.spread)(bouncing.restitution), []
     rounding = _round_speed(mechanics, velocity, ROUNDING)
     fast = bouncing.slow + rounding
@@ -139,10 +149,11 @@ def _find_demand(mechanics: Mechanics, scene: _Scene, velocity: Velocity, openin
     return tuple(speed for speed, _, _ in found), tuple(acts & by_world(lacks, acts) for _, acts, _ in found)
 
 
-def _sweep(mechanics: Mechanics, groups: Groups, scene: _Scene, this: _Round) -> _Round:
+def _sweep(mechanics: Mechanics, groups: Groups, links: Links | None, scene: _Scene, this: _Round) -> _Round:
     """One sweep further; a world whose sweeps have converged is at the beginning of its next round."""
     contacts, demand = scene.contacts, Demand.hard(this.speeds, this.active)
-    velocity, impulses = sweep_contacts(mechanics, this.velocity, groups, contacts, demand, this.impulses)
+    links = scene.find_links(links)
+    velocity, impulses = sweep_contacts(mechanics, this.velocity, groups, contacts, demand, this.impulses, links)
     moved = jax.vmap(mechanics.measure_size)(map_components(jnp.subtract, impulses, this.impulses), contacts)
     # an impulse changes the speed of a contact by at least that much
     change = find_largest([(contacts.mass[0] + contacts.mass[1]) * moved])
@@ -150,9 +161,10 @@ def _sweep(mechanics: Mechanics, groups: Groups, scene: _Scene, this: _Round) ->
     following = _find_demand(mechanics, scene, velocity, measure_openings(mechanics, velocity, groups, contacts))
     begin = lambda new, old: jnp.where(by_world(ends, old), new, old)  # noqa: E731
     speeds, active = jax.tree.map(begin, following, (this.speeds, this.active))
+    total = map_components(lambda before, now, then: before + now - then, this.total, impulses, this.impulses)
     impulses = map_components(lambda part: begin(0.0, part), impulses)
     rounds, sweeps = this.round + ends.astype(jnp.int32), jnp.where(ends, 0, this.sweep + 1)
-    return _Round(velocity, impulses, speeds, active, rounds, sweeps)
+    return _Round(velocity, impulses, total, speeds, active, rounds, sweeps)
 
 
 def _round_speed(mechanics: Mechanics, velocity: Velocity, units: int) -> Array:

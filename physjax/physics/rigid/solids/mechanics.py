@@ -29,6 +29,10 @@ Kept = tuple[Array, ...]
 """What is kept of contacts in groups from one sub-step to the next."""
 
 
+Spread = Callable[[tuple[Velocity, Velocity]], tuple[Velocity, Velocity]]
+"""Of changes of the velocities of both bodies of contacts, were they free, what is left where they are joined to others."""
+
+
 class Pose(NamedTuple):
     """Where bodies are and how fast they move, each component `(bodies, worlds)`."""
 
@@ -94,12 +98,13 @@ class Touching(NamedTuple):
 class Mechanics(ABC):
     """How bodies are placed, move and touch in the plane, or in space.
 
-    `remembered` is how many numbers are kept of a contact from one step to the next, `rubbing` how many arrays of impulses
-    are friction's, `straight` how many arrays of velocities are those of the centers of mass. What is asked of contacts is
-    asked of one group: its arrays are `(..., size, worlds)`.
+    `remembered` is how many numbers are kept of a contact from one step to the next, `freedoms` in how many ways a body
+    moves, `rubbing` how many arrays of impulses are friction's, `straight` how many arrays of velocities are those of the
+    centers of mass. What is asked of contacts is asked of one group: its arrays are `(..., size, worlds)`.
     """
 
     remembered: ClassVar[int]
+    freedoms: ClassVar[int]
     rubbing: ClassVar[int]
     straight: ClassVar[int]
 
@@ -130,6 +135,14 @@ class Mechanics(ABC):
     @abstractmethod
     def find_contacts(self, world: Any, place: tuple[Array, ...], t: ArrayLike) -> Touching:
         """All contacts of bodies at these places, in groups: of pairs, then with each surface."""
+
+    @abstractmethod
+    def link(self, contacts: Any, spread: Spread) -> Any:
+        """All contacts, of bodies that move otherwise than alone where impulses change the velocities of both."""
+
+    @abstractmethod
+    def free(self, contacts: Any) -> Any:
+        """All contacts, of bodies whose masses and moments are one: what these change in velocities is what acts on bodies."""
 
     # contacts of one group
 

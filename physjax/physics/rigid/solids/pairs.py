@@ -1,5 +1,6 @@
 """Which contacts are solved at the same time: groups in which no body comes up twice, one after the other."""
 
+from collections.abc import Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -80,18 +81,24 @@ def group_contacts(pairs: np.ndarray, surfaces: int, bodies: int) -> Groups:
 
 def _colour_pairs(pairs: np.ndarray, size: int) -> list[list[tuple[int, int, int]]]:
     """Each pair in the first group that has room and neither of its bodies."""
-    groups: list[list[tuple[int, int, int]]] = []
+    groups = part_contacts([(a, b) for a, b in pairs.tolist()], size)
+    return [[(number, *pairs[number].tolist()) for number in members] for members in groups]
+
+
+def part_contacts(moves: Sequence[tuple[int, ...]], size: int) -> list[list[int]]:
+    """Numbers of contacts in groups of no more than a size, each in the first that has nothing else which moves what it moves."""
+    groups: list[list[int]] = []
     busy: list[set[int]] = []
-    for number, (a, b) in enumerate(pairs.tolist()):
-        fitting = (g for g, names in enumerate(busy) if a not in names and b not in names and len(groups[g]) < size)
+    for number, names in enumerate(moves):
+        fitting = (g for g, taken in enumerate(busy) if taken.isdisjoint(names) and len(groups[g]) < size)
         place = next(fitting, None)
         if place is None:
             groups.append([])
             busy.append(set())
             place = len(groups) - 1
-        groups[place].append((number, a, b))
-        busy[place] |= {a, b}
+        groups[place].append(number)
+        busy[place].update(names)
     return groups
 
 
-__all__ = ["Groups", "group_contacts", "list_pairs"]
+__all__ = ["Groups", "group_contacts", "list_pairs", "part_contacts"]

@@ -18,6 +18,7 @@ from physjax.backend import materialise
 from physjax.compaction import map_worlds
 from physjax.loops import Time, to_float_time
 from physjax.physics.rigid.solids.impacts import ROUNDING, Bouncing, resolve_impacts
+from physjax.physics.rigid.solids.links import Links, find_links, flatten, plan_turns
 from physjax.physics.rigid.solids.mechanics import (
     SOFT,
     Demand,
@@ -56,26 +57,33 @@ def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scen
     dt = jnp.asarray(dt, scene.state.dtype)
     h = dt / solids.substeps
     world = build_world(solids, scene, h)
+    turns = plan_turns(scene, world.groups)
     memory = jnp.moveaxis(solids.impulses.reshape(-1, *solids.impulses.shape[-3:]), 0, -1)
 
-    def take(carry: tuple[Any, Kept], substep: Array) -> tuple[tuple[Any, Kept], None]:
+    def take(carry: tuple[Any, Kept], substep: Array) -> tuple[tuple[Any, Kept], Array | None]:
         state, kept = carry
         start = t + substep.astype(h.dtype) * h
-        moved = motion(scene.replace(state=state), start, h).state
-        return _take_substep(world, scene, (state, moved), kept, to_float_time(start), h), None
+        now = scene.replace(state=state)
+        moved = motion(now, start, h).state
+        joined = world if turns is None else world._replace(links=find_links(turns, now))
+        after, kept, loads = _take_substep(joined, scene, (state, moved), kept, to_float_time(start), h)
+        return (after, kept), loads
 
     begun, substeps = (scene.state, world.mechanics.unpack(memory)), jnp.arange(solids.substeps, dtype=jnp.int32)
-    (state, kept), _ = lax.scan(jax.checkpoint(take, prevent_cse=False), begun, substeps)
+    (state, kept), loads = lax.scan(jax.checkpoint(take, prevent_cse=False), begun, substeps)
     after = jnp.moveaxis(world.mechanics.pack(kept), -1, 0).reshape(solids.impulses.shape)
+    exerted = (
+        solids.loads if loads is None else jnp.transpose(jnp.mean(loads, axis=0), (2, 1, 0)).reshape(solids.loads.shape)
+    )
     contacts = list(scene.contacts)
-    contacts[number] = eqx.tree_at(lambda solids: solids.impulses, solids, after)
+    contacts[number] = eqx.tree_at(lambda solids: (solids.impulses, solids.loads), solids, (after, exerted))
     return scene.replace(state=state, contacts=tuple(contacts))
 
 
 def _take_substep(
     world: World, scene: Scene, states: tuple[Any, Any], kept: Kept, t: ArrayLike, h: Array
-) -> tuple[Any, Kept]:
-    """What a sub-step carries on, given the state at its start and where the method alone would bring it."""
+) -> tuple[Any, Kept, Array | None]:
+    """What a sub-step carries on, given the state at its start and where the method alone would bring it, and loads of joints."""
     mechanics = world.mechanics
     # the step of each world, as a row
     h = jnp.broadcast_to(h.reshape(1, -1), (1, world.worlds))
@@ -83,15 +91,15 @@ def _take_substep(
     start, moved = materialise(t, lambda: tuple(mechanics.read_pose(state, scene) for state in states))
     way = _Way(start, mechanics.find_mean_rate(start, moved, h), moved.rate, h)
 
-    def hold(some: tuple[tuple, _Way, Kept]) -> tuple[Velocity, Velocity, Kept]:
+    def hold(some: tuple[tuple, _Way, Kept]) -> tuple[Velocity, Velocity, Kept, Array | None]:
         of_worlds, way, kept = some
         return _hold(world.with_bodies(*of_worlds), way, kept, t)
 
-    some = (world.mass, world.turning), way, kept
+    some = (world.mass, world.turning, None if world.links is None else world.links.response), way, kept
     # worlds with steps of their own have times of their own, and surfaces may move with these
     together = jnp.ndim(t) == 0 and world.substep.ndim == 0
-    places, rates, kept = map_worlds(hold, some, world.worlds, world.groups.size) if together else hold(some)
-    return mechanics.write_pose(states, places, rates, scene), kept
+    places, rates, kept, loads = map_worlds(hold, some, world.worlds, world.groups.size) if together else hold(some)
+    return mechanics.write_pose(states, places, rates, scene), kept, loads
 
 
 class _Way(NamedTuple):
@@ -103,10 +111,15 @@ class _Way(NamedTuple):
     h: Array
 
 
-def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, Velocity, Kept]:
-    """How much further bodies are [m, rad] and how much faster at the end than if nothing touched, and what is kept."""
+def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, Velocity, Kept, Array | None]:
+    """How much further bodies are [m, rad] and how much faster at the end than if nothing touched, and what is kept.
+
+    Where bodies are joined, also what contacts have exerted on each in the mean [N, N m], `(freedoms, bodies, worlds)`.
+    """
     mechanics, (start, mean, end, h) = world.mechanics, way
     touching = mechanics.find_contacts(world, start.place, t)
+    if world.links is not None:
+        world, touching, kept = _take_turns(world, world.links, touching, kept)
     changes = map_components(lambda now, after: jnp.abs(after - now), start.rate, end)
     if touching.carried_at_end is not None:
         # as forces do, surfaces change speeds: by twice as much in a sub-step as in half of it
@@ -117,15 +130,30 @@ def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, 
     speeds = measure_several(mechanics, (before, world.pad_all(mean)), world.groups, touching.contacts)
     touching = _stick(world, touching, speeds[0], start.rate, slow)
     held = materialise(t, lambda: jax.vmap(mechanics.recall)(kept, touching.contacts))
-    bounced = world.cut_all(_bounce(world, touching, (before, held), speeds, slow, h))
+    bounced, hits = _bounce(world, touching, (before, held), speeds, slow, h)
+    bounced = world.cut_all(bounced)
     impact = map_components(jnp.subtract, bounced, start.rate)
     bounced = map_components(jnp.add, mean, impact), map_components(jnp.add, end, impact)
-    moves, impulses = _hold_apart(world, touching, bounced, held, h)
+    moves, impulses, total = _hold_apart(world, touching, bounced, held, h)
     ways, rates = (
         map_components(jnp.subtract, after, before) for after, before in zip(moves, (mean, end), strict=True)
     )
     places = map_components(lambda part: by_world(h[0], part) * part, ways)
-    return places, rates, jax.vmap(mechanics.keep)(impulses, touching.contacts)
+    kept = jax.vmap(mechanics.keep)(impulses, touching.contacts)
+    if world.links is None:
+        return places, rates, kept, None
+    exerted = map_components(jnp.add, hits, total)
+    loads = sum_impulses(mechanics, mechanics.free(touching.contacts), exerted, world.incidence, None)
+    return places, rates, world.links.turns.restore(kept), flatten(loads) / h[None]
+
+
+def _take_turns(world: World, links: Links, touching: Touching, kept: Kept) -> tuple[World, Touching, Kept]:
+    """Contacts in turns, with bodies that move as joints let them."""
+    contacts, gap, carried_at_end, kept = links.turns.arrange(
+        (touching.contacts, touching.gap, touching.carried_at_end, kept)
+    )
+    touching = Touching(world.mechanics.link(contacts, links.spread), gap, touching.points, carried_at_end)
+    return world.take_turns(links), touching, kept
 
 
 def _stick(world: World, touching: Touching, speeds: Speeds, rate: Velocity, slow: Array) -> Touching:
@@ -149,8 +177,8 @@ class _Pass(NamedTuple):
 
 def _hold_apart(
     world: World, touching: Touching, velocities: tuple[Velocity, Velocity], held: Impulses, h: Array
-) -> tuple[tuple[Velocity, Velocity], Impulses]:
-    """The mean velocities and those at the end after contacts have acted, and what is kept of their impulses.
+) -> tuple[tuple[Velocity, Velocity], Impulses, Impulses]:
+    """The mean velocities and those at the end after contacts have acted, what is kept of their impulses, and these.
 
     Two passes of one and the same sweep: the first finds the mean velocities, in which gaps must not close nor overlaps
     stay; the second those at the end, with which nothing that touches may approach. What is kept is by how much the impulses
@@ -159,12 +187,12 @@ def _hold_apart(
     it has found in the mean. So errors of a sweep do not feed on themselves; friction alone follows that of the mean a little.
     """
     (mean, end), (contacts, gap, _, at_end), mechanics = velocities, touching, world.mechanics
-    push = sum_impulses(mechanics, contacts, held, world.incidence)
+    push = sum_impulses(mechanics, contacts, held, world.incidence, world.links)
     each, rubbing = by_world(h[0], gap[0]), mechanics.rubbing
 
     def sweep(this: _Pass, carried: tuple[Array, ...] | None) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
         start, seen = world.pad_all(this.velocity), contacts if carried is None else contacts._replace(carried=carried)
-        after, pressed = sweep_contacts(mechanics, start, world.groups, seen, this.demand, this.impulses)
+        after, pressed = sweep_contacts(mechanics, start, world.groups, seen, this.demand, this.impulses, world.links)
         opening = measure_openings(mechanics, after, world.groups, seen)
         cases = zip(contacts.is_point, pressed[rubbing:], gap, opening, strict=True)
         touches = tuple(is_point & ((press > 0) | (s + each * v <= 0)) for is_point, press, s, v in cases)
@@ -188,7 +216,8 @@ def _hold_apart(
         keep(anywhere, impulse) + jnp.where(anywhere, FRICTION_LEARNED * (impulse[0] - was), 0.0)
         for impulse, was in zip(impulses[:rubbing], held[:rubbing], strict=True)
     ]
-    return (moves, stops), (*grip, *map(keep, first, impulses[rubbing:]))
+    total = map_components(lambda part: part[1], impulses)
+    return (moves, stops), (*grip, *map(keep, first, impulses[rubbing:])), total
 
 
 def _bounce(
@@ -198,8 +227,8 @@ def _bounce(
     speeds: tuple[Speeds, ...],
     slow: Array,
     h: Array,
-) -> Velocity:
-    """Velocities at the start of a sub-step after the impacts of all that would reach each other in it.
+) -> tuple[Velocity, Impulses]:
+    """Velocities at the start of a sub-step after the impacts of all that would reach each other in it, and their impulses.
 
     `speeds` of contacts are those at the start and the mean ones.
     """
@@ -207,7 +236,7 @@ def _bounce(
     # forces change by `u - v` how fast the gap closes
     reach = tuple(s / by_world(h[0], s) + (u - v) for s, u, v in zip(touching.gap, middle, now, strict=True))
     bouncing = Bouncing(world.materials.restitution, slow, reach)
-    return resolve_impacts(world.mechanics, bodies, now, world.groups, touching.contacts, bouncing)
+    return resolve_impacts(world.mechanics, bodies, now, world.groups, touching.contacts, bouncing, world.links)
 
 
 __all__ = ["solve_contacts"]

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from physjax.backend import block_fusion
+from physjax.backend import any_lane, block_fusion
+from physjax.physics.rigid.solids.links import Links
 from physjax.physics.rigid.solids.mechanics import (
     Demand,
     Impulses,
@@ -27,25 +28,51 @@ from physjax.physics.rigid.solids.pairs import Groups
 
 
 def sweep_contacts(
-    mechanics: Mechanics, velocity: Velocity, groups: Groups, contacts: Any, demand: Demand, impulses: Impulses
+    mechanics: Mechanics,
+    velocity: Velocity,
+    groups: Groups,
+    contacts: Any,
+    demand: Demand,
+    impulses: Impulses,
+    links: Links | None,
 ) -> tuple[Velocity, Impulses]:
     """Velocities of all rows and impulses of all groups after each contact was solved once, group after group.
 
-    The velocities are those that the impulses given have brought about.
+    The velocities are those that the impulses given have brought about. With `links` the groups are their turns.
     """
 
     def solve(velocity: Velocity, group: tuple) -> tuple[Velocity, Impulses]:
-        (a, b), contacts, demand, impulses = block_fusion(group)
+        (a, b), columns, contacts, demand, impulses = block_fusion(group)
         ends = _pick_rows(velocity, a), _pick_rows(velocity, b)
-        new = mechanics.solve_contact(mechanics.find_speeds(ends, contacts), contacts, demand, impulses)
-        change = mechanics.find_changes(contacts, map_components(jnp.subtract, new, impulses))
-        for rows, end, more in zip((a, b), ends, change, strict=True):
-            write = lambda part, e, m, rows=rows: part.at[..., rows, :].set(e + m, unique_indices=True)  # noqa: E731
-            velocity = map_components(write, velocity, end, more)
-        return velocity, new
+        speeds = mechanics.find_speeds(ends, contacts)
+
+        def act() -> tuple[Velocity, Impulses]:
+            new = mechanics.solve_contact(speeds, contacts, demand, impulses)
+            change = mechanics.find_changes(contacts, map_components(jnp.subtract, new, impulses))
+            after = velocity
+            for rows, end, more in zip((a, b), ends, change, strict=True):
+                write = lambda part, e, m, rows=rows: part.at[..., rows, :].set(e + m, unique_indices=True)  # noqa: E731
+                after = map_components(write, after, end, more)
+            return after if links is None else links.add(after, links.answer(columns, change)), new
+
+        if links is None:
+            return act()
+        # turns of joined bodies are many, and few of their contacts touch
+        return lax.cond(
+            any_lane(_asks(mechanics, speeds, contacts, demand, impulses)), act, lambda: (velocity, impulses)
+        )
 
     rows = jnp.asarray(groups.a), jnp.asarray(groups.b)
-    return lax.scan(solve, velocity, (rows, contacts, demand, impulses))
+    columns = None if links is None else tuple(map(jnp.asarray, links.turns.columns))
+    return lax.scan(solve, velocity, (rows, columns, contacts, demand, impulses))
+
+
+def _asks(mechanics: Mechanics, speeds: Speeds, contacts: Any, demand: Demand, impulses: Impulses) -> Array:
+    """Which contacts press, or have to."""
+    openings = mechanics.find_openings(speeds, contacts)
+    cases = zip(contacts.is_point, demand.active, openings, demand.speed, strict=True)
+    asks = [jnp.any(there & active & (v < asked)) for there, active, v, asked in cases]
+    return jnp.any(jnp.stack([*asks, *(jnp.any(part != 0) for part in impulses)]))
 
 
 def _pick_rows(velocity: Velocity, rows: Array) -> Velocity:
@@ -69,7 +96,9 @@ def measure_several(
     return lax.map(measure, ((jnp.asarray(groups.a), jnp.asarray(groups.b)), contacts))
 
 
-def sum_impulses(mechanics: Mechanics, contacts: Any, impulses: Impulses, incidence: Sides) -> Velocity:
+def sum_impulses(
+    mechanics: Mechanics, contacts: Any, impulses: Impulses, incidence: Sides, links: Links | None
+) -> Velocity:
     """What impulses in groups change in the velocities of all bodies; `incidence` says which contacts each is a and b of."""
     (on_a, on_b), (of_a, of_b) = incidence, jax.vmap(mechanics.find_changes)(contacts, impulses)
 
@@ -78,7 +107,8 @@ def sum_impulses(mechanics: Mechanics, contacts: Any, impulses: Impulses, incide
         flat = flat.reshape(*flat.shape[:-3], -1, flat.shape[-1])
         return jnp.moveaxis(jnp.dot(matrix, flat, precision=lax.Precision.HIGHEST), 0, -2)
 
-    return map_components(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
+    total = map_components(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
+    return total if links is None else links.answer_all(total)
 
 
 __all__ = ["measure_openings", "measure_several", "sum_impulses", "sweep_contacts"]

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.contacts.surface import Surface
+from physjax.physics.rigid.solids.links import Links, Response
 from physjax.physics.rigid.solids.mechanics import Mechanics, Sides, Velocity, map_components
 from physjax.physics.rigid.solids.pairs import Groups, group_contacts
 from physjax.scene import Scene
@@ -16,7 +17,7 @@ from physjax.scene import Scene
 
 @runtime_checkable
 class SolidContact(Protocol):
-    """What a step needs of the contact; `impulses` are those of the step before, `(*worlds, remembered, groups, size)`."""
+    """What a step needs of the contact; `impulses` and `loads` are those of the step before, see `Solids`."""
 
     shapes: tuple[Any, ...]
     surfaces: tuple[Surface, ...]
@@ -25,6 +26,7 @@ class SolidContact(Protocol):
     pairs: tuple[tuple[int, int], ...]
     substeps: int
     impulses: Array | None
+    loads: Array | None
 
     @property
     def mechanics(self) -> Mechanics:
@@ -46,7 +48,8 @@ class World(NamedTuple):
 
     `substep` is the length of a sub-step [s], `()` or one of each world; `mass` is 1/m of both bodies of each contact,
     `(groups, size, worlds)`, 0 of what is held; `turning` what the mechanics need of their inertia; `incidence` says of
-    each body of which places in the groups it is the first and the second shape, in ones and zeros.
+    each body of which places in the groups it is the first and the second shape, in ones and zeros. `links` is what joints
+    between the bodies do, None without.
     """
 
     solids: SolidContact
@@ -59,6 +62,7 @@ class World(NamedTuple):
     turning: Any
     materials: Materials
     incidence: Sides
+    links: Links | None = None
 
     @property
     def worlds(self) -> int:
@@ -70,9 +74,18 @@ class World(NamedTuple):
         """Floating-point type of all numbers."""
         return self.mass[0].dtype
 
-    def with_bodies(self, mass: Sides, turning: Any) -> "World":
+    def with_bodies(self, mass: Sides, turning: Any, response: Response | None) -> "World":
         """The same contacts, of some of the worlds."""
-        return self._replace(mass=mass, turning=turning)
+        links = None if self.links is None or response is None else self.links._replace(response=response)
+        return self._replace(mass=mass, turning=turning, links=links)
+
+    def take_turns(self, links: Links) -> "World":
+        """The contacts in turns, for what solves them; `mass` and `turning` stay those of the groups."""
+        turns = links.turns
+        materials = turns.arrange(self.materials)
+        return self._replace(
+            groups=turns.groups, materials=materials, incidence=_find_incidence(turns.groups, self.size, self.dtype)
+        )
 
     def pad(self, numbers: Array) -> Array:
         """Numbers of the bodies `(..., bodies, worlds)`, with rows of zeros after them of what does not move."""
@@ -103,11 +116,26 @@ def build_world(solids: SolidContact, scene: Scene, substep: Array) -> World:
     pairs = np.array(solids.pairs, int).reshape(-1, 2)
     groups = group_contacts(pairs, len(slots), bodies)
     free = jnp.ones(lanes, dtype) if scene.held is None else 1 - scene.held.astype(dtype)
-    rows = np.arange(bodies)[:, None]
-    on_a, on_b = (jnp.asarray(rows == side.ravel(), dtype) for side in (groups.a, groups.b))
     mass, turning = take_sides(free / scene.mass.mass, groups), mechanics.read_turning(scene, groups, free)
     materials = _mix_materials(solids, slots, groups, (bodies, scene.state.position.shape[-1]), dtype)
-    return World(solids, mechanics, bodies, slots, groups, substep, mass, turning, materials, (on_a, on_b))
+    return World(
+        solids,
+        mechanics,
+        bodies,
+        slots,
+        groups,
+        substep,
+        mass,
+        turning,
+        materials,
+        _find_incidence(groups, bodies, dtype),
+    )
+
+
+def _find_incidence(groups: Groups, bodies: int, dtype: np.dtype) -> Sides:
+    """Of which places in the groups each body is the first and the second shape, in ones and zeros."""
+    rows = np.arange(bodies)[:, None]
+    return jnp.asarray(rows == groups.a.ravel(), dtype), jnp.asarray(rows == groups.b.ravel(), dtype)
 
 
 def take_sides(number: Array, groups: Groups) -> Sides:

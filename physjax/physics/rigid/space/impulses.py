@@ -9,13 +9,24 @@ point it is Coulomb's cone.
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from physjax.backend import any_lane, block_fusion, materialise
-from physjax.physics.rigid.solids.mechanics import ALTERNATIONS, SOFT, Demand, Impulses, Points, Sides, Speeds, Velocity
+from physjax.physics.rigid.solids.mechanics import (
+    ALTERNATIONS,
+    SOFT,
+    Demand,
+    Impulses,
+    Points,
+    Sides,
+    Speeds,
+    Spread,
+    Velocity,
+)
 from physjax.physics.rigid.space.components import (
     Vector,
     multiply,
@@ -149,9 +160,27 @@ def find_wrench(contacts: Contacts, impulses: Impulses) -> tuple[list[Array], li
     return block_fusion(([fx, fy, sum_parts(press)], [sum_parts(press * y), -sum_parts(press * x), spin]))
 
 
+def link(contacts: Contacts, spread: Spread) -> Contacts:
+    """Contacts of bodies whose velocities impulses change as `spread` says, all of them in groups."""
+    still = contacts._replace(carried=tuple(map(jnp.zeros_like, contacts.carried)))
+    none = jnp.zeros_like(contacts.axes[:, 0, 0])
+
+    def respond(wrench: Array) -> Speeds:
+        parts = [none + part for part in wrench]
+        return jax.vmap(find_speeds)(spread(jax.vmap(apply_wrench)(contacts, parts[:3], parts[3:])), still)
+
+    # the columns, each of `(groups, 3, ...)`: of the velocity of the origin, and of the angular velocity
+    velocity, spin = (jnp.moveaxis(part, 0, 2) for part in jax.vmap(respond)(jnp.eye(6, dtype=none.dtype)))
+    return contacts._replace(mobility=Mobility(velocity[:, :, :3], spin[:, :, :3], spin[:, :, 3:]))
+
+
 def find_changes(contacts: Contacts, impulses: Impulses) -> tuple[Velocity, Velocity]:
     """What impulses on b, and the opposite ones on a, change in the velocities of both."""
-    force, torque = find_wrench(contacts, impulses)
+    return apply_wrench(contacts, *find_wrench(contacts, impulses))
+
+
+def apply_wrench(contacts: Contacts, force: list[Array], torque: list[Array]) -> tuple[Velocity, Velocity]:
+    """What a force and a torque about the origin of b, and the opposite ones on a, change in the velocities of both."""
     straight, twist = multiply_back(contacts.axes, force), multiply_back(contacts.axes, torque)
     spins = [
         multiply(turning, multiply_back(swing, force) + twist)
@@ -364,6 +393,7 @@ __all__ = [
     "find_slip",
     "find_speeds",
     "find_wrench",
+    "link",
     "share_push",
     "solve_contact",
 ]

@@ -16,6 +16,7 @@ from physjax.physics.rigid.solids.mechanics import (
     Points,
     Pose,
     Speeds,
+    Spread,
     Touching,
     Velocity,
 )
@@ -41,6 +42,7 @@ class SpatialMechanics(Mechanics):
     """
 
     remembered = 6
+    freedoms = 6
     rubbing = 3
     straight = 1
 
@@ -84,6 +86,16 @@ class SpatialMechanics(Mechanics):
     def find_contacts(self, world: World, place: tuple[Array, ...], t: ArrayLike) -> Touching:
         """All contacts of bodies at these places: of pairs, then with each surface."""
         return find_contacts(world, place, t)
+
+    def link(self, contacts: Contacts, spread: Spread) -> Contacts:
+        """All contacts, of bodies that move otherwise than alone where impulses change the velocities of both."""
+        return impulses_of_contacts.link(contacts, spread)
+
+    def free(self, contacts: Contacts) -> Contacts:
+        """All contacts, of bodies whose masses and moments are one."""
+        one = jnp.ones_like(contacts.mass[0])
+        turning = jnp.eye(3, dtype=one.dtype)[None, :, :, None, None] * one[:, None, None]
+        return contacts._replace(mass=(one, one), turning=(turning, turning))
 
     def find_speeds(self, ends: tuple[Velocity, Velocity], contacts: Contacts) -> Speeds:
         """The twist of b relative to a in the frame of each contact."""
