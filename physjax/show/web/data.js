@@ -23,6 +23,14 @@ async function numbers(text, Kind, width) {
   return array;
 }
 
+/** A colour of the page's theme by its name in the style sheet; whether the theme is dark; and what is called when it changes. */
+const color = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const isDark = () => parseInt(color("--page").slice(1, 3), 16) < 128;
+function onTheme(changed) {
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", changed);
+  new MutationObserver(changed).observe(document.documentElement, { attributeFilter: ["data-theme"] });
+}
+
 /** So few nodes of springs or rods are seen as balls. */
 const FEW_NODES = 40;
 
