@@ -90,6 +90,7 @@ from typing import TYPE_CHECKING
 from physjax import physics, stepping
 from physjax.checks import quantity
 from physjax.compiling import cache
+from physjax.name_hints import refuse_name
 from physjax.particles import Particles
 from physjax.parts import Contact, Field, Force
 from physjax.physics import forces
@@ -221,7 +222,7 @@ def __getattr__(name: str) -> object:
         module, _, attribute = _LAZY[name].partition(":")
         found = import_module(module)
         return getattr(found, attribute) if attribute else found
-    raise AttributeError(f"module 'physjax' has no attribute {name!r}")
+    raise refuse_name("module 'physjax'", name, __dir__)
 
 
 def __dir__() -> list[str]:

@@ -6,6 +6,8 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any
 
+from physjax.name_hints import refuse_name
+
 
 def serve_submodules(
     package: str, path: Iterable[str]
@@ -16,7 +18,7 @@ def serve_submodules(
     def load(name: str) -> ModuleType:
         if name in names:
             return import_module(f"{package}.{name}")
-        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        raise refuse_name(f"module {package!r}", name, lambda: names)
 
     return names, load, lambda: names
 

@@ -1,5 +1,6 @@
 """Kinematic nodes: lanes whose motion is prescribed, such as the hand that shakes a flag or the limb that drags a body."""
 
+import inspect
 from collections.abc import Callable
 
 import equinox as eqx
@@ -20,7 +21,8 @@ from physjax.vectors import add_trailing_axes, components, stack_components
 class Pins(Module):
     """Prescribed motion: `Scene(..., pinned=Pins(nodes, path))` moves the lanes of the mask `nodes` along `path(t)`.
 
-    `path(t) -> positions` [m] of all lanes, `(*lanes, dim)` or broadcastable to it; only the rows of `nodes` count.
+    `path(t) -> positions` [m] of all lanes, `(*lanes, dim)` or broadcastable to it; only the rows of `nodes` count. It is a
+    function of the time alone: what starts somewhere is moved from there, `lambda t: start.position + velocity * t`.
     Forces see the nodes on the path at the time of each evaluation, with the velocity of the path (its derivative), so
     that a method keeps its order where the path is smooth; after each step the nodes are on the path exactly. `t` [s] is a
     scalar, or shaped to broadcast with the lanes where a run has many step sizes. Numbers of a path that is an
@@ -38,7 +40,7 @@ class Pins(Module):
     nodes: Bool[Array, "*lanes"] = unchecked_quantity("prescribed nodes", per="memory")
 
     def __init__(self, nodes: ArrayLike, path: Callable):
-        nodes = jnp.asarray(nodes)
+        nodes = as_mask("Pins", nodes)
         if nodes.dtype != bool:
             raise ValueError(f"Pins: got nodes of dtype {nodes.dtype}, expected booleans, one for each lane.")
         if not callable(path) or isinstance(path, type):
@@ -46,6 +48,7 @@ class Pins(Module):
                 f"Pins: got the path {path!r}, expected a function t -> positions. To hold lanes where they are, give "
                 "the mask alone: pinned=nodes."
             )
+        _demand_time_alone(path)
         self.nodes = nodes
         self.path = as_module(path)
 
@@ -106,6 +109,31 @@ class Pins(Module):
         # by components: a choice between whole vectors takes half as long again
         pairs = zip(components(prescribed), components(free), strict=True)
         return stack_components([jnp.where(self.nodes, a, b) for a, b in pairs])
+
+
+def as_mask(who: str, nodes: ArrayLike) -> Array:
+    """A mask of lanes as an array; TypeError for the name of a set, and all else that is no array."""
+    try:
+        return jnp.asarray(nodes)
+    except TypeError:
+        raise TypeError(
+            f"{who}: got {nodes!r}, expected a mask, booleans of the lanes' shape: of a lattice lattice.nodes['left']."
+        ) from None
+
+
+def _demand_time_alone(path: Callable) -> None:
+    """Raise a TypeError unless a path can be called with one argument."""
+    try:
+        signature = inspect.signature(path)
+    except ValueError:  # of some functions written in C nothing is known
+        return
+    try:
+        signature.bind(0.0)
+    except TypeError:
+        raise TypeError(
+            f"Pins: got a path that takes {signature}, expected a function of the time alone, t -> positions [m] of all "
+            "lanes. Move nodes from where they start: path=lambda t: state.position + velocity * t."
+        ) from None
 
 
 def _is_broadcastable(shape: tuple[int, ...], whole: tuple[int, ...]) -> bool:

@@ -41,7 +41,7 @@ from physjax.parts import (
     prepare_force,
     unify_gravity,
 )
-from physjax.pins import Pins
+from physjax.pins import Pins, as_mask
 from physjax.quantities import (
     build_lane_mask,
     build_vector_mask,
@@ -116,7 +116,7 @@ class Scene(Module):
             pinned = pinned.prepare(state)
             state = pinned.prescribe(0.0, state)
         elif pinned is not None:
-            pinned = jnp.asarray(pinned)
+            pinned = as_mask("pinned", pinned)
             if pinned.dtype != bool or pinned.shape != lanes:
                 raise ValueError(
                     f"pinned: got {pinned.dtype} of shape {pinned.shape}, expected booleans of the lanes' shape {lanes}."

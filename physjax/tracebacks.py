@@ -6,6 +6,7 @@ At the public constructors and functions those frames are dropped; `JAX_TRACEBAC
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+
+from physjax.name_hints import refuse_name, suggest_names
 
 WRAPPER_PACKAGES = {"physjax", "contextlib", "functools", "equinox", "jaxtyping", "beartype"}
 """Packages whose frames are between a user's line and a check of ours."""
@@ -85,7 +88,12 @@ def _add_signature(error: Exception, called: Any) -> None:
     if isinstance(error, TypeError) and words.startswith((f"{name} got an unexpected", f"{name} missing")):
         taken = inspect.signature(called).parameters.values()
         shown = (p.name if p.default is p.empty else f"{p.name}=" for p in taken)
-        error.args = (f"{words}. It takes {', '.join(shown)}.",)
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", words)
+        hint = suggest_names(unknown[1], [p.name for p in taken]) if unknown else ""
+        words = words.partition(". Did you mean")[0]  # Python's own guess, from 3.13 on, knows no synonyms
+        error.args = (
+            " ".join([f"{words}.", *([hint] if hint.startswith("Did") else []), f"It takes {', '.join(shown)}."]),
+        )
 
 
 def _list_user_frames(trace: TracebackType | None) -> list[TracebackType]:
@@ -123,9 +131,12 @@ else:
     Base = type(eqx.Module)
 
     class ShortModule(Base):
-        """The type of modules whose construction fails with a short traceback."""
+        """The type of modules whose construction fails with a short traceback, and that know what a wrong name meant."""
 
         __call__ = shorten_tracebacks(Base.__call__)
+
+        def __getattr__(cls, name):
+            raise refuse_name(f"type object {cls.__name__!r}", name, lambda: dir(cls))
 
     class Module(eqx.Module, metaclass=ShortModule):
         """A module of Equinox whose construction fails with a short traceback."""

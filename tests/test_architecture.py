@@ -23,6 +23,7 @@ FILES = {path.relative_to(ROOT).as_posix(): path for path in sorted(ROOT.rglob("
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 
 FLOORS = (
+    {"name_hints"},
     {"backend", "tracebacks"},
     {
         "vectors",

@@ -137,7 +137,7 @@ MISTAKES = {
     "a negative drag": (lambda: forces.StokesDrag(-0.2), "expected numbers >= 0"),
     "a keyword that is none": (
         lambda: Scene(BALL, force=()),
-        r"keyword argument 'force'. It takes state, mass=, forces=",
+        r"keyword argument 'force'\. Did you mean forces\? It takes state, mass=, forces=",
     ),
     "a keyword of a part that is none": (lambda: forces.SpinLift(spin=3.0), r"'spin'. It takes \w+"),
     "a run without a method": (lambda: simulate(FALL), "It takes scene, method, dt"),

@@ -19,7 +19,8 @@ GUIDE = (
     "Which run to take? Choose the error that you can accept (a hundredth is rarely seen in a game, 1e-4 is below a pixel) and "
     "take what stands in that column. If several methods are about as fast, take the simplest.",
     "In the charts of error against run time lower left is better. The band is the Pareto front: no run is both faster and more "
-    "accurate than one on it. Where errors are drawn against the step, the slope of a line is the order of its method.",
+    "accurate than one on it. Where errors are drawn against the step, the slope of a line is the order of its method; it is "
+    "unseen where fewer than three runs lie between those that are too coarse and those that rounding has bent.",
 )
 """How the page of charts is read."""
 DEFAULT_SCENES = ("fall_with_drag", "oscillator", "kepler", BOUNCING_SCENE)

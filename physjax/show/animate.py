@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from jax.typing import ArrayLike
 
 from physjax.checks import as_positive_integer, as_real_quantity
+from physjax.name_hints import hint_at_names
 from physjax.physics.springs.assembly import Lattice
 from physjax.physics.springs.rods import Distances
 from physjax.physics.springs.springs import Springs
@@ -154,3 +155,6 @@ def particles(
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -107,9 +107,12 @@ def _take_rods(
 
 
 def _find_unbroken(who: str, film: Trajectory, lines: Springs | Distances, index: tuple[int, ...]) -> np.ndarray | None:
-    """Which lines are intact at every frame, `(frames, lines)`, as the run recorded; None where none can break."""
+    """Which lines are intact at every frame, `(frames, lines)`: as the run recorded, or as they were cut; None: all of them."""
     if lines.breaks_at is None:
-        return None
+        if lines.unbroken is None:
+            return None
+        held = _select_scene(np.asarray(lines.unbroken), index)
+        return np.broadcast_to(held, (len(film.time), len(held)))
     for part in film.parts:
         if type(part) is type(lines) and np.array_equal(part.pairs, lines.pairs):
             held = np.asarray(part.unbroken)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 import numpy as np
 from jax.typing import ArrayLike
 
+from physjax.name_hints import hint_at_names
 from physjax.show import solids
 from physjax.show.bodies import bodies
 from physjax.show.frames import find_up_axis
@@ -164,3 +165,6 @@ def sweep(
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

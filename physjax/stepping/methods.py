@@ -26,6 +26,7 @@ import math
 from jax.typing import ArrayLike
 
 from physjax.loops import Time
+from physjax.name_hints import hint_at_names
 from physjax.stepping.adaptive import adaptive, count_steps
 from physjax.stepping.boris import take_boris_step
 from physjax.stepping.compositions import BLANES_MOAN_4, KAHAN_LI_8, compose_leapfrogs, take_split_step
@@ -271,3 +272,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

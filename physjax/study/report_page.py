@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from datetime import date
 from typing import TYPE_CHECKING, NamedTuple
 
+from physjax.show.dark import shows_map, turn_dark
+from physjax.show.pages import read_web_file
 from physjax.text import describe_machine
 
 if TYPE_CHECKING:
@@ -22,12 +24,16 @@ LONG_CELL = 20
 
 
 class Picture(NamedTuple):
-    """An encoded picture, what it shows in words, and the CSS pixels below which its letters are illegible."""
+    """An encoded picture, what it shows in words, and the CSS pixels below which its letters are illegible.
+
+    `dark` is the same picture for a dark page; without it there is one for both.
+    """
 
     data: bytes
     alt: str
     width: int = 0
     kind: str = "png"
+    dark: bytes = b""
 
 
 class Table(NamedTuple):
@@ -44,14 +50,21 @@ class Section:
 
 
 def encode_figure(figure: "Figure", alt: str) -> Picture:
-    """A matplotlib figure as a picture; the figure is closed. A wide one is whole on a phone, and is enlarged by a tap."""
+    """A matplotlib figure as a picture, maps on light paper, others in dark too; it is closed.
+
+    A wide one is whole on a phone, and is enlarged by a tap.
+    """
     from matplotlib import pyplot as plt
 
-    file = io.BytesIO()
-    figure.savefig(file, dpi=PIXELS_PER_INCH)
+    light, dark = io.BytesIO(), io.BytesIO()
+    figure.savefig(light, dpi=PIXELS_PER_INCH)
+    if not shows_map(figure):
+        turn_dark(figure)
+        figure.savefig(dark, dpi=PIXELS_PER_INCH)
     plt.close(figure)
     inches = figure.get_figwidth()
-    return Picture(file.getvalue(), alt, round(READABLE_PIXELS_PER_INCH * inches) if inches > PHONE_WIDTH_INCHES else 0)
+    width = round(READABLE_PIXELS_PER_INCH * inches) if inches > PHONE_WIDTH_INCHES else 0
+    return Picture(light.getvalue(), alt, width, dark=dark.getvalue())
 
 
 def build_page(title: str, summary: str, sections: Sequence[Section], *, guide: Sequence[str] = ()) -> str:
@@ -68,18 +81,26 @@ def build_page(title: str, summary: str, sections: Sequence[Section], *, guide: 
             f'<section id="{_make_anchor(section)}"><h2>{html.escape(section.heading)}</h2>\n{blocks}\n</section>'
         )
     parts.append(f"<footer>Measured {date.today():%Y-%m-%d} on {html.escape(describe_machine())}.</footer>")
-    return _PAGE.format(title=html.escape(title), body="\n".join(parts))
+    return _PAGE.format(title=html.escape(title), colors=read_web_file("colors.css"), body="\n".join(parts))
 
 
 def _render_block(block: str | Picture | Table) -> str:
     if isinstance(block, Picture):
-        source = f"data:image/{block.kind};base64,{base64.b64encode(block.data).decode()}"
-        picture = f'<img alt="{html.escape(block.alt)}" src="{source}"'
-        if not block.width:
-            return f"{picture}>"
-        box = f'<input type="checkbox" aria-label="enlarge: {html.escape(block.alt)}">'
-        return f'<label class="wide">{box}{picture} style="--width: {block.width}px"></label>'
+        return _render_picture(block)
     return _render_table(block.text) if isinstance(block, Table) else f"<p>{html.escape(block)}</p>"
+
+
+def _render_picture(picture: Picture) -> str:
+    encode = lambda data: f"data:image/{picture.kind};base64,{base64.b64encode(data).decode()}"  # noqa: E731
+    alt = html.escape(picture.alt)
+    width = f' style="--width: {picture.width}px"' if picture.width else ""
+    image = f'<img alt="{alt}" src="{encode(picture.data)}"{width}>'
+    if picture.dark:
+        dark = f'<source media="(prefers-color-scheme: dark)" srcset="{encode(picture.dark)}">'
+        image = f"<picture>{dark}{image}</picture>"
+    if not picture.width:
+        return image
+    return f'<label class="wide"><input type="checkbox" aria-label="enlarge: {alt}">{image}</label>'
 
 
 def _render_table(text: str) -> str:
@@ -129,29 +150,30 @@ _PAGE = """<!doctype html>
 <title>{title}</title>
 <style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }}
-body {{ color: #222; background: #fff; }}
+{colors}body {{ color: var(--ink); background: var(--page); }}
+a {{ color: var(--accent); }}
 .wide {{ display: block; overflow-x: auto; position: relative; }}
 .wide input {{ position: absolute; left: 0; top: 0; opacity: 0; }}
-.wide input:focus-visible + img {{ outline: 2px solid #0072B2; }}
-img {{ display: block; max-width: 100%; height: auto; }}
-pre {{ overflow-x: auto; background: #f6f6f6; padding: 1em; font-size: 13px; line-height: 1.4; white-space: pre-wrap; }}
+.wide input:focus-visible ~ :is(img, picture img) {{ outline: 2px solid var(--accent); }}
+img {{ display: block; max-width: 100%; height: auto; border-radius: 4px; }}
+pre {{ overflow-x: auto; background: var(--bar); padding: 1em; font-size: 13px; line-height: 1.4; white-space: pre-wrap; }}
 .table {{ overflow-x: auto; }}
 table {{ border-collapse: collapse; font-size: 14px; margin: 1em 0; }}
-th, td {{ padding: 4px 12px 4px 0; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top; }}
+th, td {{ padding: 4px 12px 4px 0; text-align: left; border-bottom: 1px solid var(--line); vertical-align: top; }}
 .number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-footer {{ color: #666; margin: 3em 0; }}
+footer {{ color: var(--pale); margin: 3em 0; }}
 @media (max-width: 745px) {{
   .wide img {{ cursor: zoom-in; }}
-  .wide input:checked + img {{ max-width: none; width: var(--width); cursor: zoom-out; }}
+  .wide input:checked ~ :is(img, picture img) {{ max-width: none; width: var(--width); cursor: zoom-out; }}
   table {{ width: 100%; }}
-  .wide::after {{ content: "tap to enlarge"; color: #666; font-size: 12px; }}
+  .wide::after {{ content: "tap to enlarge"; color: var(--pale); font-size: 12px; }}
   .grid {{ font-size: 11px; line-height: 1.3; }}
   .grid th, .grid td {{ padding: 4px 3px 4px 0; }}
   .grid td.number {{ white-space: nowrap; }}
   .list tr:first-child {{ display: none; }}
   .list tr, .list td {{ display: block; border: 0; padding: 0; text-align: left; }}
-  .list tr {{ border-bottom: 1px solid #ddd; padding: 6px 0; }}
-  .list td::before {{ content: attr(data-header) ": "; color: #666; }}
+  .list tr {{ border-bottom: 1px solid var(--line); padding: 6px 0; }}
+  .list td::before {{ content: attr(data-header) ": "; color: var(--pale); }}
 }}
 </style>
 {body}

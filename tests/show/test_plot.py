@@ -116,6 +116,9 @@ def test_the_legend_has_room_below_the_panels():
     assert sum("promised" in label for label in labels) == len(runs) / len(study.runs)
     unpromised = study._replace(promised={"verlet": float("nan")}).plot()
     assert not any("promised" in text.get_text() for text in unpromised.legends[0].get_texts())
+    adaptive = tuple(run._replace(method="adaptive rk4", dt=None, tolerance=1e-3) for run in study.runs)
+    toleranced = study._replace(runs=adaptive, promised={"adaptive rk4": 4.0}).plot()
+    assert toleranced.legends[0].get_texts()[0].get_text() == "adaptive rk4", "without steps no order can be seen"
 
 
 def test_table_is_aligned():

@@ -183,3 +183,19 @@ def test_bodies_without_a_shape_are_bars_between_their_joints():
     film = simulate(hung, methods.verlet, dt=0.01, steps=1)
     (bar,) = find_default_look(film)
     np.testing.assert_allclose(bar.corners, [[0.5, 0.0], [-0.5, 0.0]])
+
+
+@pytest.mark.parametrize("scene", [None, 0, 1])
+def test_cut_springs_are_broken_ones_without_a_strain(scene):
+    rope = lattices.rope((0.0, 0.0), (3.0, 0.0), 4, mass=1.0, stiffness=100.0)
+    cut = np.array([False, True, False])
+    cuts = cut if scene is None else np.stack([cut, ~cut])
+    x = rope.state.position if scene is None else np.broadcast_to(rope.state.position, (2, 4, 2))
+    tie = rope.springs.cut(cuts)
+    whole = Scene(Particles(x, np.zeros_like(x)), 0.25, (forces.Gravity(), tie))
+    film = simulate(whole, methods.verlet, dt=0.01, steps=2)
+    lines = take_lines("plot.springs", film, tie, scene)
+    assert lines.held.tolist() == [(cut if scene == 1 else ~cut).tolist()] * 3
+    intact, broken = layers(plot.springs(film, tie, -1, scene=scene).axes[0])
+    assert len(intact.get_segments()) == lines.held[0].sum()
+    assert len(broken.get_segments()) == (~lines.held[0]).sum()

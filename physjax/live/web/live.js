@@ -19,7 +19,8 @@ function fill(node, buffers) {
 }
 
 function make(tag, properties = {}, ...children) {
-  const made = Object.assign(document.createElement(tag), properties);
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(properties)) name in made ? made[name] = value : made.setAttribute(name, value);
   made.append(...children);
   return made;
 }
@@ -35,23 +36,26 @@ function scale({ low, high, stops, whole, logarithmic }) {
 }
 
 function addSlider(panel, what, changed) {
-  const { least, most, value, place } = scale(what), number = make("output", {});
-  const input = make("input", { type: "range", min: least, max: most, step: 1 });
-  const name = make("span", { textContent: what.name + (what.unit ? ` [${what.unit}]` : "") });
+  const title = what.name + (what.unit ? ` [${what.unit}]` : "");
+  // a reader is told the value by the slider itself, and the name without it
+  const { least, most, value, place } = scale(what), number = make("span", { className: "number", "aria-hidden": "true" });
+  const input = make("input", { type: "range", min: least, max: most, step: 1, "aria-label": title });
   const set = x => { input.value = place(x); write(x); };
-  const write = x => { number.textContent = show(x); input.setAttribute("aria-valuetext", `${show(x)} ${what.unit}`); };
+  const write = x => { number.textContent = show(x); input.setAttribute("aria-valuetext", `${show(x)} ${what.unit}`.trim()); };
   // another whole number is another program: it is asked for when the slider is let go
   input.addEventListener("input", () => { write(value(+input.value)); if (!what.whole) changed(value(+input.value)); });
   input.addEventListener("change", () => { if (what.whole) changed(value(+input.value)); });
-  panel.append(make("label", {}, make("span", { className: "name" }, name, number), input));
+  panel.append(make("label", {}, make("span", { className: "name" }, make("span", { textContent: title }), number), input));
   return { set, input };
 }
 
-/** Build the view in `root`; `spec` says what can be set and holds the first film, `channel` is null where nothing answers. */
-export function mount(root, spec, channel) {
+/** Build the view in `root`; `spec` says what can be set and holds the first film, `channel` is null where nothing answers.
+ * `keys` is where keys are heard: a page of its own has all of them, in a notebook the others are the notebook's. */
+export function mount(root, spec, channel, keys = root) {
   const settings = structuredClone(spec.start), frame = make("iframe", { title: "the run", srcdoc: spec.page });
-  const status = make("span", { className: "status" }), strip = make("dl", { className: "strip" });
-  const panel = make("div", { className: "panel" }), code = make("pre", { hidden: true, tabIndex: 0 });
+  const status = make("span", { className: "status", role: "status" }), strip = make("dl", { className: "strip", "aria-label": "what the run is worth" });
+  const panel = make("div", { className: "panel", role: "group", "aria-label": "settings" });
+  const code = make("pre", { hidden: true, tabIndex: 0, role: "region", "aria-label": "code of these settings" });
   const theme = findTheme();
   let ticket = 0, flying = null, waiting = null, ready = false, shown = spec.box, ghostBox = null, turn = true, changedAt = 0, lastTime = 0;
   const queue = [], since = new Map();
@@ -68,7 +72,7 @@ export function mount(root, spec, channel) {
     sliders.set("method", { set: name => { choice.value = name; }, input: choice });
   }
   sliders.set("dt", addSlider(panel, { ...spec.dt, name: "step dt" }, x => { settings.dt = x; change(); }));
-  const reset = make("button", { type: "button", textContent: "reset" }), write = make("button", { type: "button", textContent: "code" });
+  const reset = make("button", { type: "button", textContent: "reset", title: "all settings as they were at first" }), write = make("button", { type: "button", textContent: "code" });
   write.setAttribute("aria-expanded", "false");
   panel.append(make("div", { className: "buttons" }, reset, write, status), code);
   root.append(make("div", { className: "top" }, frame, panel), strip);
@@ -125,7 +129,8 @@ export function mount(root, spec, channel) {
     else if (kind === "dropped") landed(number);
     else if (kind === "code") { code.textContent = message.text; toggleCode(); }
   }
-  function say(text, grade) { status.textContent = text; status.dataset.grade = grade; }
+  /** What went wrong or takes time is read out, and not that every picture has come. */
+  function say(text, grade) { status.setAttribute("aria-live", grade === "good" ? "off" : "polite"); status.textContent = text; status.dataset.grade = grade; }
   function post(message) { ready ? frame.contentWindow.postMessage(message, "*") : queue.push(message); }
   function showStrip(figures) {
     strip.replaceChildren(...figures.map(figure => {
@@ -156,14 +161,18 @@ export function mount(root, spec, channel) {
     reset.onclick = () => { Object.assign(settings, structuredClone(spec.start)); put(); turn = true; change(); };
     write.onclick = () => code.hidden ? channel.send({ ticket, ...structuredClone(settings), code: true }) : toggleCode();
   }
-  root.addEventListener("keydown", event => {
-    if (event.key !== " " || ["BUTTON", "SELECT"].includes(event.target.tagName)) return;
+  /** Space plays wherever it presses no button; the arrows show other moments where they move no slider and scroll no code. */
+  function press(event) {
+    const { key, target: { tagName } } = event, plays = key === " ", steps = key === "ArrowLeft" || key === "ArrowRight";
+    if (event.shiftKey || event.ctrlKey || event.altKey || event.metaKey || ["BUTTON", "SELECT", "TEXTAREA"].includes(tagName)) return;
+    if (!plays && !(steps && !["INPUT", "PRE"].includes(tagName))) return;
     event.preventDefault(); event.stopPropagation();
-    post({ press: " " });
-  });
+    post({ press: key });
+  }
+  keys.addEventListener("keydown", press);
   // JupyterLab takes the arrow keys of whatever is no text field, unless it says so itself
   for (const part of root.querySelectorAll("input, select, button")) part.dataset.lmSuppressShortcuts = "true";
-  return () => removeEventListener("message", heard);
+  return () => { removeEventListener("message", heard); keys.removeEventListener("keydown", press); };
 }
 
 /** Notebooks have a theme of their own; elsewhere the system's counts. */

@@ -46,6 +46,7 @@ Example:
   are timed are far cheaper. With an emitter `adaptive` refuses both, because every particle then has steps of its own.
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.physics.contacts import segments, shapes
 from physjax.physics.contacts.motion import Motion
 from physjax.physics.contacts.restitution import Coulomb
@@ -63,3 +64,6 @@ __all__ += shapes.__all__
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+hint_at_names(__name__)

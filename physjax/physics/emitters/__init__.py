@@ -5,6 +5,7 @@ where a run was resumed. Particles of an emitter do not interact, smoke is drawn
 `energy.ledger` does not follow births and deaths.
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.physics.emitters.appearance import Appearance, Look
 from physjax.physics.emitters.births import Birth
 from physjax.physics.emitters.emitter import Emitter
@@ -15,3 +16,6 @@ __all__ = ["Appearance", "Birth", "Box", "Disc", "Emitter", "Look", "Mesh", "Poi
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -31,6 +31,7 @@ Example:
     verlet: 1.07 s, set by the stiffness of HardSpring, λ = ±1.871i 1/s
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.physics.forces import air, gravitation, laws, rocket, soft_spheres, tabulated_drag, time_dependent, weight
 from physjax.physics.forces.air import *  # noqa: F403
 from physjax.physics.forces.gravitation import *  # noqa: F403
@@ -56,3 +57,6 @@ __all__ += weight.__all__
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+hint_at_names(__name__)

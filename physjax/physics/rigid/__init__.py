@@ -33,6 +33,7 @@ each other, `(SurfaceContact(hull, surface),)` out of surfaces alone. `Joints` h
   plane a million.
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.physics.rigid.axis_joints import Hinges, Sliders
 from physjax.physics.rigid.body_points import (
     angular_acceleration,
@@ -106,3 +107,7 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)
+hint_at_names(f"{__name__}.inertia")

@@ -47,6 +47,11 @@ def bodies(
         [ 0.  0. 10.]
     """
     _demand_frame(frame)
+    if not isinstance(inertia, Inertia):
+        raise TypeError(
+            f"bodies: got the inertia {inertia!r}, expected that of a solid, such as inertia.sphere(mass, radius). Bodies in "
+            "the plane are made by rigid.planar_bodies."
+        )
     named = {"position [m]": position, "velocity [m/s]": velocity, "angular velocity [rad/s]": angular_velocity}
     x, v, omega = (as_real_quantity(name, value) for name, value in named.items())
     q = check_quaternion("orientation", orientation)

@@ -13,6 +13,7 @@ Triangles are connected by the vertices that they share; vertices at the same pl
 - Reverse mode through springs costs ten to twenty forward runs.
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.physics.springs.rods import Rods, Ropes
 from physjax.physics.springs.springs import Springs
 
@@ -21,3 +22,6 @@ __all__ = ["Rods", "Ropes", "Springs"]
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -1,8 +1,9 @@
 """Nodes, their masses and their springs in one record, as which every rope, sheet and bridge is returned."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -13,6 +14,24 @@ from physjax.particles import Particles
 from physjax.physics.springs.springs import Springs
 from physjax.physics.springs.wind import Cells, Triangles, Wind
 from physjax.summaries import Row, format_number, format_part, write_summary, write_table
+
+
+class NodeSets(dict[str, np.ndarray]):
+    """Masks of nodes by the names of their sets; a wrong name is answered by those that there are."""
+
+    def __missing__(self, name: str) -> np.ndarray:
+        raise KeyError(f"nodes: got {name!r}, expected the name of a set: {', '.join(self)}.")
+
+
+def _flatten_sets(sets: NodeSets) -> tuple[list[tuple[Any, np.ndarray]], tuple[str, ...]]:
+    """As JAX flattens a dictionary: by its sorted names."""
+    names = tuple(sorted(sets))
+    return [(jax.tree_util.DictKey(name), sets[name]) for name in names], names
+
+
+jax.tree_util.register_pytree_with_keys(
+    NodeSets, _flatten_sets, lambda names, masks: NodeSets(zip(names, masks, strict=True))
+)
 
 
 class Lattice(NamedTuple):
@@ -112,7 +131,7 @@ def build_lattice(
     total = as_real_quantity("mass [kg]", mass, above=0)
     springs = Springs(pairs, stiffness, rest, damping, breaks_at, nodes=len(x), yields_at=yields_at)
     node_mass = total * jnp.asarray(share / share.sum(), total.dtype)
-    return Lattice(state, node_mass, springs, sets, faces, shape)
+    return Lattice(state, node_mass, springs, NodeSets(sets), faces, shape)
 
 
 def _join_stiffness(kinds: list[tuple[np.ndarray, NestedArrayLike]]) -> Array:

@@ -17,10 +17,13 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.checks import NestedArrayLike, as_positive_integer, as_real_quantity
+from physjax.name_hints import hint_at_names
 from physjax.physics.springs.assembly import Lattice, build_lattice, vector_lengths
 from physjax.physics.springs.mesh_sheets import from_mesh
+from physjax.tracebacks import shorten_tracebacks
 
 
+@shorten_tracebacks
 def rope(
     start: NestedArrayLike,
     end: NestedArrayLike,
@@ -77,6 +80,7 @@ def rope(
     )
 
 
+@shorten_tracebacks
 def cloth(
     width: float,
     height: float,
@@ -155,6 +159,7 @@ def _check_sheet_frame(
     return corner, across / vector_lengths(across), down / vector_lengths(down)
 
 
+@shorten_tracebacks
 def jelly(
     size: Sequence[float],
     nodes: Sequence[int],
@@ -223,6 +228,7 @@ def _triangulate_surface(shape: tuple[int, ...]) -> np.ndarray:
     return np.concatenate(faces)
 
 
+@shorten_tracebacks
 def bridge(
     span: float,
     height: float,
@@ -245,6 +251,14 @@ def bridge(
         >>> truss = lattices.bridge(4.0, 1.0, panels=4, mass=100.0, stiffness=2e4)
         >>> len(truss.state.position), len(truss.springs.pairs), int(truss.nodes["supports"].sum())
         (10, 21, 2)
+
+        Cut in two, where a vertical line crosses its beams:
+
+        >>> x = truss.state.position[truss.springs.pairs][..., 0]
+        >>> crossing = (x.min(axis=1) < 1.5) & (x.max(axis=1) > 1.5)
+        >>> halves = truss.springs.cut(crossing)
+        >>> int(crossing.sum()), int(halves.unbroken.sum())
+        (4, 17)
     """
     panels = as_positive_integer("panels", panels, at_least=1)
     sides = [span, height] if width is None else [span, height, width]
@@ -309,3 +323,6 @@ __all__ = ["Lattice", "bridge", "cloth", "from_mesh", "jelly", "rope"]
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -10,8 +10,10 @@ from physjax.checks import NestedArrayLike, as_real_quantity
 from physjax.meshes import check_mesh, find_near_pieces, read_mesh
 from physjax.meshes import weld as join_vertices
 from physjax.physics.springs.assembly import Lattice, build_lattice, vector_lengths
+from physjax.tracebacks import shorten_tracebacks
 
 
+@shorten_tracebacks
 def from_mesh(
     mesh: str | os.PathLike[str] | NestedArrayLike,
     faces: NestedArrayLike | None = None,

@@ -23,6 +23,27 @@ async function numbers(text, Kind, width) {
   return array;
 }
 
+/** A colour of the page's theme by its name in the style sheet; whether the theme is dark; and what is called when it changes. */
+const color = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const isDark = () => parseInt(color("--page").slice(1, 3), 16) < 128;
+function onTheme(changed) {
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", changed);
+  new MutationObserver(changed).observe(document.documentElement, { attributeFilter: ["data-theme"] });
+}
+
+/** Let the keyboard do what the mouse does on a picture: shift and the arrows call `move(aside, up)` by steps, + and - `zoom(factor)`. */
+function steer(canvas, move, zoom) {
+  addEventListener("keydown", event => {
+    if (![document.body, canvas].includes(event.target) || event.ctrlKey || event.altKey || event.metaKey) return;
+    const step = { ArrowRight: [1, 0], ArrowLeft: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    const factor = { "+": 1.15, "=": 1.15, "-": 1 / 1.15 }[event.key];
+    if (event.shiftKey && step) move(...step);
+    else if (factor) zoom(factor);
+    else return;
+    event.preventDefault();
+  });
+}
+
 /** So few nodes of springs or rods are seen as balls. */
 const FEW_NODES = 40;
 

@@ -177,9 +177,9 @@ def _draw_legend(figure: "Figure", result: WorkPrecision) -> float:
 
 
 def _format_label(result: WorkPrecision, method: str) -> str:
-    if method not in result.promised:
-        return f"{method} (adaptive)"
+    if all(run.dt is None for run in result.of(method)):  # no step, no slope
+        return method if method.startswith("adaptive") else f"{method} (adaptive)"
     order = result.observed_order(method)
     observed = "exact" if math.isinf(order) else "order unseen" if math.isnan(order) else f"order {order:.2f}"
-    promised = result.promised[method]
+    promised = result.promised.get(method, math.nan)
     return f"{method}: {observed}" + ("" if math.isnan(promised) else f" (promised {promised:.0f})")

@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
+from physjax.constraints.mechanism import find_constraints
 from physjax.particles import callable_name
 from physjax.parts import Function
 from physjax.programs import iterate_operations
@@ -131,13 +132,20 @@ def list_adaptive_methods(scene: Scene) -> list[Adaptive]:
 
 
 def promised_order(method: Callable, velocity_dependent: bool, scene: Scene) -> float:
-    """The order that a method promises for a scene; at most 1 where something is resolved at the end of a step."""
+    """The order that a method promises for a scene.
+
+    At most that of the step of joints and rods, whatever moves between them; at most 1 where something is resolved at the
+    end of a step.
+    """
     if isinstance(method, Adaptive):
         return float(method.order)
     promises = read_promises(method)
     if promises is None:
         return float("nan")
     order = float(promises.order_with_drag if velocity_dependent else promises.order)
+    constraints = find_constraints(scene)
+    if constraints:
+        order = min(order, float(max(part.order for part in constraints)))
     # what happens within a step but is resolved at its end is late by up to dt
     return min(order, 1.0) if scene.resolves_at_step_end else order
 

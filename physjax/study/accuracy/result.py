@@ -10,6 +10,7 @@ import numpy as np
 
 from physjax.files import write_atomically
 from physjax.show.style import AS_GIVEN, PROJECTED
+from physjax.study.accuracy.observed_order import fit_order, fit_scattered_order
 from physjax.summaries import format_number, write_grid, write_summary
 from physjax.text import format_seconds, format_table
 
@@ -24,10 +25,6 @@ MAX_EXACT_FLOOR = 1e-10
 """A truth whose own error is larger than this, relative to the path, cannot say of a run that it is exact."""
 LARGEST_FITTED_ERROR = 0.05
 """Error, relative to the path, above which a run is too coarse to show its order."""
-FITTED_STEPS_RATIO = 8.0
-"""Steps up to this many times the finest are fitted: coarser ones still bend."""
-LEAST_SCATTERED_FALL = 10.0
-"""How far errors that scatter must fall over all steps for their slope to mean something."""
 
 
 class Run(NamedTuple):
@@ -131,26 +128,19 @@ class WorkPrecision(NamedTuple):
         return tuple(run for run in self.runs if run.method == method)
 
     def observed_order(self, method: str) -> float:
-        """Slope of log error against log dt over the finest runs above rounding; inf if all is rounding, NaN if unknown.
+        """The order that errors show: their slope against dt where it lasts; inf if all is rounding, NaN if it is unseen.
 
-        Over all runs above rounding where contacts are projected or springs break: those errors scatter with where in a
-        step it happens to fall. The truth's own error counts as rounding, but no run is called exact by such a truth.
+        It is that of the finest three or more runs on a line, see `observed_order.fit_order`; where contacts are projected
+        or springs break, of all runs: those errors scatter with where in a step it happens to fall. The truth's own error
+        counts as rounding, but no run is called exact by such a truth.
         """
         runs = [run for run in self.of(method) if run.dt is not None and run.status == "ok"]
         if runs and all(run.path_error <= self._rounding_error(run) for run in runs):
             return float("inf") if self.floor <= MAX_EXACT_FLOOR else float("nan")
-        resolved = [
-            (run.dt, run.path_error)
-            for run in runs
-            if run.dt is not None and self._rounding_error(run) < run.path_error < LARGEST_FITTED_ERROR
-        ]
+        resolved = [run for run in runs if self._rounding_error(run) < run.path_error < LARGEST_FITTED_ERROR]
         scattered = self.scattered or any(run.treatment == PROJECTED for run in runs)
-        finest = [(dt, error) for dt, error in resolved if dt < FITTED_STEPS_RATIO * resolved[-1][0] or scattered]
-        errors = [error for _, error in finest]
-        # errors that scatter show a slope only if they fall by much more than they scatter
-        if len(finest) < 3 or (scattered and max(errors) < LEAST_SCATTERED_FALL * min(errors)):
-            return float("nan")
-        return float(np.polyfit(np.log([dt for dt, _ in finest]), np.log(errors), 1)[0])
+        fit = fit_scattered_order if scattered else fit_order
+        return fit([run.dt for run in resolved if run.dt is not None], [run.path_error for run in resolved])
 
     def fastest(self, error: float, *, rivals: bool = True) -> Run | None:
         """The run with the least time whose path error stays below `error`; None if none does."""

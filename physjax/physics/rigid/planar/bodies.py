@@ -14,6 +14,7 @@ from physjax.particles import Particles, check_load_shape, sum_terms
 from physjax.parts import Force
 from physjax.physics.rigid.planar_inertia import PlanarInertia
 from physjax.physics.rigid.spatial import Load, Wrench
+from physjax.tracebacks import shorten_tracebacks
 from physjax.vectors import dot, scale
 
 
@@ -160,6 +161,7 @@ class PlanarBodies(NamedTuple):
         return PlanarBodies(*(a.astype(dtype) for a in state)), mass.validate(lanes, dtype)
 
 
+@shorten_tracebacks
 def planar_bodies(
     inertia: PlanarInertia,
     position: NestedArrayLike = (0.0, 0.0),
@@ -177,6 +179,11 @@ def planar_bodies(
         >>> crates.momentum.tolist()
         [[2.0, 0.0], [2.0, 0.0]]
     """
+    if not isinstance(inertia, PlanarInertia):
+        raise TypeError(
+            f"planar_bodies: got the inertia {inertia!r}, expected that of a shape in the plane, such as "
+            "inertia.planar_disc(mass, radius). Bodies in space are made by rigid.bodies."
+        )
     named = {
         "position [m]": position,
         "angle [rad]": angle,

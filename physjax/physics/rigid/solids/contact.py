@@ -1,6 +1,6 @@
 """Solids, in the plane and in space: bodies that may not pass each other, nor surfaces, with restitution and friction."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import NestedArrayLike, Numbers, as_positive_integer, quantity, unchecked_quantity
-from physjax.parts import Contact
+from physjax.parts import Contact, as_tuple
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.contacts.surface import Surface
 from physjax.physics.rigid.planar.bodies import PlanarBodies
@@ -92,8 +92,8 @@ class Solids(Contact):
         pairs: NestedArrayLike | None = None,
         substeps: int = SUBSTEPS,
     ):
-        self.shapes = (shapes,) if isinstance(shapes, PlanarShape | Shape) else tuple(shapes)
-        self.surfaces = tuple(surfaces)
+        self.shapes = tuple(shapes) if isinstance(shapes, Iterable) else (shapes,)
+        self.surfaces = as_tuple("surface", surfaces)
         self.restitution = restitution
         self.coulomb = coulomb
         self.pairs = None if pairs is None else _as_tuples(np.asarray(pairs))
