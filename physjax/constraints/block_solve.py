@@ -19,6 +19,8 @@ MAX_DENSE_ROWS = 4
 """Up to here elimination row by row, written out, is the smaller program."""
 MAX_UNROLLED_LEVELS = 2
 """So few levels are written out one after the other; more are a loop, whose program does not grow with them."""
+MAX_UNROLLED_ROWS = 3
+"""The same of the rows of a block."""
 PIVOT_ROUNDINGS = 64
 """A pivot of no more than as many roundings of what stood there is zero: its row follows from the others."""
 
@@ -126,48 +128,35 @@ def _take_padded(array: Array, index: Array | np.ndarray) -> Array:
 
 def _sum_terms(array: Array, index: Array | np.ndarray) -> Array:
     """Σ of entries of the last axis but one, over the first axis of the index."""
-    if not index.shape[0]:
-        return jnp.zeros((*array.shape[:-2], index.shape[1], array.shape[-1]), array.dtype)
-    padded = jnp.pad(array, [(0, 0)] * (array.ndim - 2) + [(0, 1), (0, 0)])
-    total = _take(padded, index[0])
-    for term in range(1, index.shape[0]):
-        total = total + _take(padded, index[term])
-    return total
+    return jnp.sum(_take_padded(array, index), axis=-3)
 
 
 def _multiply(a: Array, b: Array) -> Array:
     """Products of blocks."""
-    total = a[:, 0, None] * b[None, 0]
-    for k in range(1, a.shape[1]):
-        total = total + a[:, k, None] * b[None, k]
-    return total
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
 def _apply(a: Array, x: Array) -> Array:
     """Products of blocks and vectors."""
-    total = a[:, 0] * x[0][None]
-    for k in range(1, a.shape[1]):
-        total = total + a[:, k] * x[k][None]
-    return total
+    return jnp.sum(a * x[None], axis=1)
 
 
 def _invert(a: Array, size: Array) -> Array:
     """Inverses of blocks by Gauss and Jordan; a row whose pivot is zero within rounding stays out, with its column."""
-    rounding = PIVOT_ROUNDINGS * float(jnp.finfo(a.dtype).eps)
-    rows = a.shape[0]
-    for k in range(rows):
-        pivot = a[k, k]
-        good = jnp.abs(pivot) > rounding * size[k]
+    least = PIVOT_ROUNDINGS * float(jnp.finfo(a.dtype).eps) * size
+
+    def sweep(k: Array, a: Array) -> Array:
+        pick = lambda array, axis: lax.dynamic_index_in_dim(array, k, axis, keepdims=False)  # noqa: E731
+        at = (jnp.arange(len(a)) == k)[:, None, None]
+        row, column = pick(a, 0), pick(a, 1)
+        pivot = pick(row, 0)
+        good = jnp.abs(pivot) > pick(least, 0)
         inverse = jnp.where(good, 1.0 / jnp.where(good, pivot, 1.0), 0.0)
-        row = a[k] * inverse[None]
-        column = a[:, k]
-        others = jnp.asarray([0.0 if i == k else 1.0 for i in range(rows)], a.dtype)[:, None, None]
-        # every row but the k-th without its part in column k, whose place is taken by that of the inverse
-        swept = a - (others * column)[:, None] * row[None]
-        swept = swept.at[k].set(row)
-        swept = swept.at[:, k].set(-others * column * inverse[None])
-        a = swept.at[k, k].set(inverse)
-    return a
+        row = jnp.where(at, 1.0, row) * inverse[None]
+        column = jnp.where(at, -1.0, column)
+        return jnp.where(at[:, None] | at[None], 0.0, a) - column[:, None] * row[None]
+
+    return lax.fori_loop(0, len(a), sweep, a, unroll=len(a) <= MAX_UNROLLED_ROWS)
 
 
 __all__ = ["Blocks", "solve_blocks"]

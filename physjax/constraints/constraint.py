@@ -171,8 +171,9 @@ class Constraint(Force):
         if (pairs < 0).any():
             world = self.world_places(places.dtype)[..., None]
             places = jnp.concatenate([places, jnp.broadcast_to(world, (*world.shape[:2], places.shape[2]))], axis=1)
-        first, second = np.where(pairs < 0, np.int32(bodies - 1) - pairs, pairs).T
-        return tuple(jnp.take(places, end, axis=1, mode="clip") for end in (first, second))  # pyright: ignore[reportReturnType]
+        ends = np.where(pairs < 0, np.int32(bodies - 1) - pairs, pairs).T.ravel()
+        first, second = jnp.split(jnp.take(places, ends, axis=1, mode="clip"), 2, axis=1)
+        return first, second
 
 
 def check_joint_pairs(name: str, pairs: ArrayLike | Sequence, places: int | None) -> Pairs:

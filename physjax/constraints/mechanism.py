@@ -112,10 +112,7 @@ class Mechanism(NamedTuple):
         ends = jnp.sum(jacobian * both[None], axis=1)
         padded = jnp.pad(ends, ((0, 0), (0, 1), (0, 0)))
         slots = _list_ends_of_bodies(self.pairs, len(self.free))
-        total = jnp.take(padded, slots[0], axis=1, mode="clip")
-        for slot in slots[1:]:
-            total = total + jnp.take(padded, slot, axis=1, mode="clip")
-        return self.free[None] * total
+        return self.free[None] * jnp.sum(jnp.take(padded, slots, axis=1, mode="clip"), axis=1)
 
     def measure_rates(self, jacobian: Jacobian, rates: Moves) -> Rows:
         """How fast the joints open: J q̇."""
@@ -149,7 +146,7 @@ class Mechanism(NamedTuple):
     def build_matrix(self, jacobian: Jacobian, moved: Jacobian) -> Blocks:
         """J M⁻¹ Jᵀ, from the Jacobian at one place and M⁻¹Jᵀ there or at another; one for rows that a joint lacks or lost."""
         plan, joints = self.plan, len(self.pairs)
-        whole = _contract(jacobian, moved)
+        whole = jnp.sum(jacobian[:, :, None] * moved[:, None], axis=0)
         own = whole[..., :joints, :] + whole[..., joints:, :]
         lacks = np.concatenate(
             [np.repeat(np.arange(self.rows) >= p.rows, len(p.pairs)).reshape(self.rows, -1) for p in self.parts], axis=1
@@ -162,14 +159,11 @@ class Mechanism(NamedTuple):
                 + (np.eye(self.rows)[..., None] * ~lacks).astype(own.dtype)[..., None] * (1 - self.whole)[None, None]
             )
         pad = lambda a: jnp.pad(a, [(0, 0), (0, 0), (0, 1), (0, 0)])  # noqa: E731
-        left, right = pad(jacobian), pad(moved)
-        pick = lambda a, ends: jnp.take(a, ends, axis=-2, mode="clip")  # noqa: E731
-        empty = jnp.zeros((*own.shape[:2], len(plan.edges), own.shape[-1]), own.dtype)
-        lower, upper = empty, empty
-        for early, late in plan.shared:
-            lower = lower + _contract(pick(left, late), pick(right, early))
-            upper = upper + _contract(pick(left, early), pick(right, late))
-        return Blocks(own, lower, upper)
+        # the early and the late end of each edge, or the other way round, for all bodies that the joints of an edge share
+        pick = lambda a, ends: jnp.take(pad(a), ends, axis=-2, mode="clip")  # noqa: E731
+        left, right = pick(jacobian, plan.shared[:, ::-1]), pick(moved, plan.shared)
+        both = jnp.sum(left[:, :, None] * right[:, None], axis=(0, 3))
+        return Blocks(own, both[:, :, 0], both[:, :, 1])
 
     def solve(self, matrix: Blocks, right: Rows) -> Rows:
         """The impulses with matrix λ = right."""
@@ -192,11 +186,6 @@ def find_constraints(scene: PyTree) -> tuple[Constraint, ...]:
 def hold_rows(jacobian: Jacobian, held: Array) -> Jacobian:
     """The Jacobian with zeros for the rows `(rows, joints, worlds)` that are not held, whose impulse is then found to be zero."""
     return jacobian * jnp.concatenate([held, held], axis=-2).astype(jacobian.dtype)[None]
-
-
-def _contract(left: Array, right: Array) -> Array:
-    """Σ over freedoms of the products of all rows with all rows, `(rows, rows, entries, worlds)`."""
-    return jnp.sum(left[:, :, None] * right[:, None], axis=0)
 
 
 @cache

@@ -32,16 +32,17 @@ def stop_opening(
     """
     coordinates, mass = mechanism.coordinates, scene.mass
     places, rates = coordinates.read_places(state), coordinates.read_rates(state, mass)
+    mobility = coordinates.read_mobility(state, mass)
     jacobian, x = mechanism.differentiate(places)
     opening = mechanism.measure_rates(jacobian, rates)
     bounds = mechanism.find_bounds(x)
     if bounds is None:
-        λ = _solve_impulses(mechanism, mass, state, jacobian, -opening)
+        λ = _solve_impulses(mechanism, mobility, jacobian, -opening)
     else:
         if near is None:
-            near = TOUCHING * mechanism.measure_tolerance(places, coordinates.read_mobility(state, mass))
+            near = TOUCHING * mechanism.measure_tolerance(places, mobility)
         none = jnp.zeros_like(opening[0, 0])
-        λ = _solve_bounded(mechanism, mass, state, jacobian, opening, bounds.speeds(x, none if h is None else h, near))
+        λ = _solve_bounded(mechanism, mobility, jacobian, opening, bounds.speeds(x, none if h is None else h, near))
     return coordinates.push(state, mass, mechanism.sum_at_bodies(jacobian, λ))
 
 
@@ -63,7 +64,7 @@ def project_joints(scene: PyTree, state: PyTree) -> PyTree:
             within = jnp.clip(x, bounds.low, bounds.high)
             jacobian = hold_rows(jacobian, (x != within) | (bounds.low == bounds.high))
             x = x - within
-        λ = _solve_impulses(mechanism, mass, state, jacobian, -x)
+        λ = _solve_impulses(mechanism, coordinates.read_mobility(state, mass), jacobian, -x)
         # bodies that rest, pushed and left alone for a second
         still = state.hold_lanes(jnp.zeros(state.lanes, state.dtype))
         moved = coordinates.push(still, mass, mechanism.sum_at_bodies(jacobian, λ)).drift(whole, mass)
@@ -174,24 +175,21 @@ def _find_multipliers(mechanism: Mechanism, scene: PyTree, state: PyTree, rate: 
         return jax.jvp(lambda moves: mechanism.measure(coordinates.displace(places, moves)), (still,), (rates,))[1]
 
     speed, change = jax.jvp(opening, (state,), (rate,))
-    places = coordinates.read_places(state)
+    places, mobility = coordinates.read_places(state), coordinates.read_mobility(state, mass)
     jacobian, x = mechanism.differentiate(places)
     bounds = mechanism.find_bounds(x)
     if bounds is None:
-        return jacobian, _solve_impulses(mechanism, mass, state, jacobian, -change)
-    near = TOUCHING * mechanism.measure_tolerance(places, coordinates.read_mobility(state, mass))
+        return jacobian, _solve_impulses(mechanism, mobility, jacobian, -change)
+    near = TOUCHING * mechanism.measure_tolerance(places, mobility)
     fastest = jnp.max(jnp.abs(coordinates.read_rates(state, mass)), axis=(0, 1))
     # what rests moves by rounding: no farther in a second than what counts as touching
     slow = lax.stop_gradient(jnp.maximum(float(jnp.finfo(x.dtype).eps) ** 0.5 * fastest, near))
     allowed = bounds.accelerations(x, speed, near, slow)
-    return jacobian, _solve_bounded(mechanism, mass, state, jacobian, change, allowed)
+    return jacobian, _solve_bounded(mechanism, mobility, jacobian, change, allowed)
 
 
-def _solve_bounded(
-    mechanism: Mechanism, mass: PyTree, state: PyTree, jacobian: Jacobian, right: Rows, allowed: Range
-) -> Rows:
+def _solve_bounded(mechanism: Mechanism, mobility: Array, jacobian: Jacobian, right: Rows, allowed: Range) -> Rows:
     """The λ with which x = right + J M⁻¹ Jᵀ λ is within what is allowed: first which limits hold, then their impulses."""
-    mobility = mechanism.coordinates.read_mobility(state, mass)
     moved = mechanism.move_by_impulses(mobility, jacobian)
     allowed = allowed._replace(scale=lax.stop_gradient(mechanism.measure_mobilities(jacobian, moved)))
 
@@ -201,7 +199,7 @@ def _solve_bounded(
     def solve(steps: Steps) -> Rows:
         driven, held = allowed.find_impulse(steps), are_held(steps)
         left = jnp.where(held, allowed.find_target(steps) - respond(driven), 0.0)
-        return driven + _solve_impulses(mechanism, mass, state, hold_rows(jacobian, held), left)
+        return driven + _solve_impulses(mechanism, mobility, hold_rows(jacobian, held), left)
 
     def find() -> tuple[Rows, Steps]:
         def turn(carry: tuple) -> tuple:
@@ -230,9 +228,8 @@ def _solve_bounded(
     return answer(known, numbers)
 
 
-def _solve_impulses(mechanism: Mechanism, mass: PyTree, state: PyTree, jacobian: Jacobian, right: Rows) -> Rows:
+def _solve_impulses(mechanism: Mechanism, mobility: Array, jacobian: Jacobian, right: Rows) -> Rows:
     """The λ with J M⁻¹ Jᵀ λ = right, differentiable through what the matrix does alone."""
-    mobility = mechanism.coordinates.read_mobility(state, mass)
 
     def apply(λ: Rows) -> Rows:
         return mechanism.measure_rates(jacobian, mechanism.change_rates(mobility, jacobian, λ))
