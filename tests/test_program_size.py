@@ -135,6 +135,22 @@ def test_a_room_of_sixty_walls_costs_what_one_of_six_does():
     assert counts[0] <= 1.2 * counts[1]
 
 
+@pytest.mark.parametrize(
+    ("kind", "options", "most"),
+    [
+        (rigid.Hinges, {"limits": (-1.0, 1.0)}, 480),
+        (rigid.Hinges, {}, 270),
+        (rigid.Joints, {"cone": 1.0}, 195),
+    ],
+)
+def test_the_derivative_of_joints_in_space_which_a_step_takes_many_times_is_small(kind, options, most):
+    joints = kind([(0, 1)], np.zeros((1, 2, 3)), axis=(0.0, 0.0, 1.0), **options)
+    bodies = rigid.bodies(inertia.box(1.0, (0.1, 0.2, 0.3)), np.zeros((2, 3)))
+    reader = joints.coordinates(bodies)
+    differentiate = jax.jit(lambda places: joints.differentiate(reader, *joints.find_ends(places)))
+    assert count_operations(differentiate.lower(reader.read_places(bodies))) <= most
+
+
 def test_what_is_counted_is_what_the_program_holds():
     def program(x):
         pair = jnp.concatenate([x, x])

@@ -18,12 +18,11 @@ from physjax.physics.rigid.body_joints import (
     as_axes,
     check_axis,
     check_joints,
-    differentiate_cosine,
     differentiate_rows,
-    dot_components,
+    subtract_arms,
     subtract_points,
 )
-from physjax.physics.rigid.joint_coordinates import SpatialCoordinates
+from physjax.physics.rigid.joint_coordinates import SpatialCoordinates, cross_rows, dot_components, normalise
 from physjax.physics.rigid.joint_drives import DrivenJoints, Limits
 from physjax.physics.rigid.turns import measure_turn, remember_turns
 
@@ -97,29 +96,38 @@ class Hinges(DrivenJoints):
 
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
         """From the first point to the second [m], in space the cosines of one axis across the other, and the angle [rad]."""
-        rows = subtract_points(self.place_ends(first, second))
-        if self.axis is not None:
-            rows += [dot_components(*pair) for pair in self._turn_axes(first, second)]
-        return jnp.stack([*rows, self._measure_angle(first, second)] if self.bounded else rows)
+        if self.axis is None:
+            rows = subtract_points(self.place_ends(first, second))
+            return jnp.stack([*rows, self._measure_angle(first, second)] if self.bounded else rows)
+        axes = self._find_axes()
+        return self._stack_rows(first, second, axes, *self.turn_ends(first, second, self._choose_directions(axes)))
 
     def differentiate(self, reader: Coordinates, first: Places, second: Places) -> tuple[Rows, PushedRows, PushedRows]:
         """The rows and their change with moves of either end, in space in closed form; of the angle, as the axes are closed."""
         if self.axis is None:
             return super().differentiate(reader, first, second)
-        ends, pairs = self.place_ends(first, second), self._turn_axes(first, second)
-        rows = [*subtract_points(ends), *(dot_components(*pair) for pair in pairs)]
-        angles = [differentiate_cosine(*pair) for pair in pairs]
+        axes = self._find_axes()
+        arms, pairs = self.turn_ends(first, second, self._choose_directions(axes))
+        across = cross_rows(pairs[:, 0], pairs[:, 1])
         if self.bounded:
-            axis = pairs[0][0]
-            rows.append(self._measure_angle(first, second))
-            angles.append(([-a for a in axis], axis))
-        return jnp.stack(rows), *differentiate_rows(ends, (first, second), angles)
+            across = jnp.concatenate([across, -pairs[:, 0, :1]], axis=1)
+        return self._stack_rows(first, second, axes, arms, pairs), *differentiate_rows(arms, across)
 
-    def _turn_axes(self, first: Places, second: Places) -> list[tuple[list[Array], list[Array]]]:
-        """The axis of the first body of each joint and, twice, a direction across that of the second, in the world frame."""
-        reader, axes = self.reader, jnp.moveaxis(jnp.asarray(self.axis), 0, 2)[..., None]
-        axis = reader.turn(first, axes[0] / jnp.sqrt(jnp.sum(axes[0] ** 2, axis=0, keepdims=True)))
-        return [(axis, reader.turn(second, normal)) for normal in reader.find_normals(axes[1])]
+    def _find_axes(self) -> Array:
+        """The directions of the axes in the frames of both bodies, `(3, 2, joints, 1)`."""
+        return normalise(jnp.transpose(jnp.asarray(self.axis))[..., None])
+
+    def _choose_directions(self, axes: Array) -> Array:
+        """Pairs that are across each other, `(3, 2, 2, joints, 1)`: the first body's axis, twice, and normals of the second's."""
+        axis, normals = axes[:, 0], SpatialCoordinates().find_normals(axes[:, 1])
+        return jnp.stack([jnp.stack([axis, axis], axis=1), jnp.stack(normals, axis=1)], axis=1)
+
+    def _stack_rows(self, first: Places, second: Places, axes: Array, arms: Array, pairs: Array) -> Rows:
+        """The rows in space, given what is turned with the bodies."""
+        rows = [subtract_arms(first, second, arms), jnp.sum(pairs[:, 0] * pairs[:, 1], axis=0)]
+        if self.bounded:
+            rows.append(SpatialCoordinates().measure_twist(first, second, axes)[None])
+        return jnp.concatenate(rows)
 
     def angle(self, state: PyTree) -> Float[Array, "*scenes joints"]:
         """By how much the second body of each joint is turned relative to the first [rad], in space from -π to π."""
@@ -127,10 +135,9 @@ class Hinges(DrivenJoints):
         return self._measure_angle(*ends).T.reshape(*state.lanes[:-1], len(self.pairs))
 
     def _measure_angle(self, first: Places, second: Places) -> Float[Array, "joints worlds"]:
-        reader = self.reader
-        if self.axis is None or not isinstance(reader, SpatialCoordinates):
-            return reader.compare(first, second)[0]
-        return reader.measure_twist(reader.compare(first, second), *jnp.moveaxis(self.axis, 0, 2)[..., None])
+        if self.axis is None:
+            return self.reader.compare(first, second)[0]
+        return SpatialCoordinates().measure_twist(first, second, self._find_axes())
 
     def unwrap(self, x: Rows, near: Rows) -> Rows:
         """In space the angle is known up to turns."""
@@ -205,7 +212,7 @@ class Sliders(DrivenJoints):
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
         """From the first point to the second across the axis [m], how far the bodies have turned [rad], and the travel [m]."""
         apart, reader = subtract_points(self.place_ends(first, second)), self.reader
-        axis = self.axis.T[..., None]
+        axis = normalise(self.axis.T[..., None])
         rows = [dot_components(apart, reader.turn(first, normal)) for normal in reader.find_normals(axis)]
         rows += measure_turn(self, self.turns, first, second)
         return jnp.stack([*rows, self._measure_travel(first, apart)] if self.bounded else rows)
@@ -217,9 +224,7 @@ class Sliders(DrivenJoints):
         return travel.T.reshape(*state.lanes[:-1], len(self.pairs))
 
     def _measure_travel(self, first: Places, apart: list[Array]) -> Float[Array, "joints worlds"]:
-        axis = self.axis.T[..., None]
-        along = axis / jnp.sqrt(jnp.sum(axis * axis, axis=0, keepdims=True))
-        return dot_components(apart, self.reader.turn(first, along))
+        return dot_components(apart, self.reader.turn(first, normalise(self.axis.T[..., None])))
 
     def prepare(self, state: PyTree, mass: PyTree) -> "Sliders":
         """The joints as part of a scene, with the turn of their bodies at its start."""

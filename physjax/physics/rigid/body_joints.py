@@ -26,6 +26,10 @@ from physjax.physics.rigid.spatial import Load, RigidBodies, Wrench
 
 Ends = tuple[list[Array], list[Array]]
 """The points of the first and of the second bodies in the world, in components `(joints, worlds)`."""
+TURNS = np.array([[[(i - j) * (j - k) * (k - i) / 2 for k in range(3)] for i in range(3)] for j in range(3)])[
+    ..., None, None
+]
+"""The component i of e_j × e_k."""
 
 
 class BodyJoints(Constraint, Load):
@@ -59,6 +63,18 @@ class BodyJoints(Constraint, Load):
         points = jnp.moveaxis(self.points, 0, 2)[..., None]
         return self.reader.place_points(first, points[0]), self.reader.place_points(second, points[1])
 
+    def turn_ends(self, first: Places, second: Places, directions: Array | None = None) -> tuple[Array, Array]:
+        """In space the ways from the centres of both bodies to the points [m], `(3, 2, joints, worlds)`, and directions in the
+        world frame, `(3, 2, directions, joints, worlds)`, given in those of the bodies.
+
+        All of them in one turn, for a small program.
+        """
+        vectors = jnp.transpose(self.points)[:, :, None, :, None]
+        if directions is not None:
+            vectors = jnp.concatenate([vectors, directions], axis=2)
+        turned = SpatialCoordinates().turn_each(jnp.stack([first, second], axis=1)[:, :, None], vectors)
+        return turned[:, :, 0], turned[:, :, 1:]
+
     def prepare(self, state: PyTree, mass: PyTree) -> Self:
         """The joints as part of a scene, closed at its start; a ValueError where they cannot be."""
         name, dim = type(self).__name__, self.coordinates(state).dim
@@ -75,37 +91,22 @@ class BodyJoints(Constraint, Load):
         return joints
 
 
-def differentiate_rows(
-    ends: Ends, places: tuple[Places, Places], angles: Sequence[tuple[Sequence[Array], Sequence[Array]]]
-) -> tuple[PushedRows, PushedRows]:
+def differentiate_rows(arms: Array, across: Array | None = None) -> tuple[PushedRows, PushedRows]:
     """How rows of joints in space change with moves of the first bodies and of the second: the way from the first point to the
-    second in three rows, then angles, each given by the vectors along which its row changes with turns of either body.
+    second in three rows, then angles, given by the vectors along which they change with turns of the first.
 
-    A point r from the centre moves by d + ω × r. Sums of few arrays, since a compiler computes parts of a stack anew.
+    A point r from the centre moves by d + ω × r. `arms` are r of both ends, `(3, 2, joints, worlds)`, and `across`
+    `(3, angles, joints, worlds)`.
     """
-    rows, both = 3 + len(angles), []
+    both = []
     for side, sign in enumerate((-1.0, 1.0)):
-        arm = [p - c for p, c in zip(ends[side], places[side][:3], strict=True)]
-        moves = np.zeros((6, rows))
-        moves[:3, :3] = sign * np.eye(3)
-        total = jnp.broadcast_to(moves[..., None, None].astype(arm[0].dtype), (6, rows, *arm[0].shape))
-        for k in range(3):
-            turns = np.zeros((6, rows))
-            # ω × r: the change of row i with the turn about j, for each component k of r
-            turns[3 + (k + 2) % 3, (k + 1) % 3], turns[3 + (k + 1) % 3, (k + 2) % 3] = sign, -sign
-            total = total + turns[..., None, None].astype(arm[0].dtype) * arm[k][None, None]
-            for row, vectors in enumerate(angles):
-                about = np.zeros((6, rows))
-                about[3 + k, 3 + row] = 1.0
-                total = total + about[..., None, None].astype(arm[0].dtype) * vectors[side][k][None, None]
-        both.append(total)
+        # ω × r: the change of row i with the turn about j, for each component k of r
+        turns = jnp.sum((sign * TURNS).astype(arms.dtype) * arms[None, None, :, side], axis=2)
+        if across is not None:
+            turns = jnp.concatenate([turns, -sign * across], axis=1)
+        moves = (sign * np.eye(3, turns.shape[1]))[..., None, None].astype(arms.dtype)
+        both.append(jnp.concatenate([jnp.broadcast_to(moves, turns.shape), turns]))
     return both[0], both[1]
-
-
-def differentiate_cosine(a: Sequence[Array], b: Sequence[Array]) -> tuple[list[Array], list[Array]]:
-    """The vectors along which a·b of a direction of the first body and one of the second changes with their turns."""
-    across = [a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)]
-    return across, [-c for c in across]
 
 
 def check_joints(
@@ -149,12 +150,9 @@ def subtract_points(ends: Ends) -> list[Array]:
     return [b - a for a, b in zip(*ends, strict=True)]
 
 
-def dot_components(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    """The scalar product of vectors in components."""
-    total = a[0] * b[0]
-    for p, q in zip(a[1:], b[1:], strict=True):
-        total = total + p * q
-    return total
+def subtract_arms(first: Places, second: Places, arms: Array) -> Array:
+    """The same of joints in space `(3, joints, worlds)`, given the ways to the points from the centres."""
+    return (second[:3] - first[:3]) + (arms[:, 1] - arms[:, 0])
 
 
 def read_bodies(bodies: RigidBodies | PlanarBodies) -> Places:
@@ -170,10 +168,9 @@ __all__ = [
     "as_axes",
     "check_axis",
     "check_joints",
-    "differentiate_cosine",
     "differentiate_rows",
-    "dot_components",
     "put_joints_last",
     "read_bodies",
+    "subtract_arms",
     "subtract_points",
 ]

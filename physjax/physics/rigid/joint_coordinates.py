@@ -1,15 +1,16 @@
 """Rigid bodies as joints read and move them: in the plane by x, y and an angle, in space by a place and a quaternion."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from physjax.constraints.coordinates import Moves, Places, put_worlds_first, put_worlds_last
 from physjax.physics.rigid.inertia import Inertia
-from physjax.physics.rigid.mobility import Mobility
 from physjax.physics.rigid.planar.bodies import PlanarBodies
 from physjax.physics.rigid.planar_inertia import PlanarInertia
 from physjax.physics.rigid.spatial import RigidBodies, angular_velocity
-from physjax.vectors import conjugate_quaternion, multiply_quaternions, rotate_components, scale
+from physjax.vectors import broadcast_vector, conjugate_quaternion, multiply_quaternions, rotate_components, scale
 
 OPPOSITE_COSINE = -1 + 1e-6
 """The cosine of the angle [1] from which on two vectors count as opposite."""
@@ -86,7 +87,7 @@ class PlanarCoordinates:
 
     def find_normals(self, axis: Array) -> list[Array]:
         """The direction across an axis `(2, joints, 1)`."""
-        return [_normalise(jnp.stack([-axis[1], axis[0]]))]
+        return [normalise(jnp.stack([-axis[1], axis[0]]))]
 
 
 class SpatialCoordinates:
@@ -117,9 +118,13 @@ class SpatialCoordinates:
 
     def read_mobility(self, state: RigidBodies, mass: Inertia) -> Array:
         """1/m and the columns of R I⁻¹ Rᵀ."""
-        inverse, columns = Mobility.of(state, mass)
-        parts = [put_worlds_last(inverse, state.lanes)[None], *(put_worlds_last(c, state.lanes) for c in columns)]
-        return jnp.concatenate(parts)
+        read = lambda vector, like: put_worlds_last(broadcast_vector(vector, like), state.lanes)  # noqa: E731
+        frame = put_worlds_last(state.orientation, state.lanes)
+        if mass.axes is not None:
+            frame = jnp.stack(multiply_quaternions(list(frame), list(read(mass.axes, state.orientation))))
+        matrix, inverse = _find_rotation(frame), read(mass.inverse, state.position)
+        turning = jnp.sum((matrix * inverse[None])[:, None] * matrix[None], axis=2)
+        return _join(put_worlds_last(1 / mass.mass, state.lanes)[None], turning.reshape(9, *frame.shape[1:]))
 
     def measure_bodies(self, mobility: Array) -> Array:
         """The radius of gyration [m] about an axis of mean mobility."""
@@ -153,6 +158,11 @@ class SpatialCoordinates:
         """Vectors of bodies in the world frame, in components."""
         return rotate_components(list(places[3:]), list(vectors))
 
+    def turn_each(self, places: Places, vectors: Array) -> Array:
+        """Vectors of bodies `(3, *rest)` in the world frame, where the places have as many axes."""
+        # a sum over an axis: what it returns is stored, where its readers would compute components anew
+        return jnp.sum(_find_rotation(places[3:]) * vectors[None], axis=1)
+
     def compare(self, first: Places, second: Places) -> Array:
         """How the second bodies are turned relative to the first, as quaternions `(4, joints, worlds)`."""
         return jnp.stack(multiply_quaternions(conjugate_quaternion(list(first[3:])), list(second[3:])))
@@ -164,31 +174,33 @@ class SpatialCoordinates:
         twice = jnp.where(w < 0, -2.0, 2.0)
         return [twice * part for part in u]
 
-    def measure_twist(self, turn: Array, first: Array, second: Array) -> Array:
-        """By which angle a turn is about an axis [rad], from -π to π, given as a vector `(3, joints, 1)` in both frames.
+    def measure_twist(self, first: Places, second: Places, axes: Array) -> Array:
+        """By which angle the second bodies are turned relative to the first about an axis [rad], from -π to π.
 
-        It is zero where the shortest turn leads one frame to the other that leads one vector to the other.
+        It is given as unit vectors in both frames, `(3, 2, joints, 1)`. The angle is zero where the shortest turn leads one
+        frame to the other that leads one vector to the other.
         """
-        a, b = _normalise(first), _normalise(second)
-        cosine, sine = _dot(a, b), list(_cross(b, a))
-        # opposite vectors have many shortest turns, of which one about any direction across them is taken
-        across = self.find_normals(first)[0]
-        opposite = cosine < OPPOSITE_COSINE
-        shortest = [
-            jnp.where(opposite, 0.0, 1.0 + cosine),
-            *(jnp.where(opposite, n, s) for n, s in zip(across, sine, strict=True)),
-        ]
-        w, *u = multiply_quaternions(list(turn), conjugate_quaternion(shortest))
-        s = _dot(u, a)
+        a, b = axes[:, 0], axes[:, 1]
+        cosine = jnp.sum(a * b, axis=0, keepdims=True)
+        # the shortest turn s and (0, a) s; opposite vectors have many, of which one about any direction across is taken
+        shortest = jnp.stack(
+            [jnp.concatenate([1.0 + cosine, cross_rows(b, a)]), jnp.pad(a + b, [(1, 0), (0, 0), (0, 0)])], 1
+        )
+        about = jnp.pad(jnp.stack(self.find_normals(a), axis=1), [(1, 0), (0, 0), (0, 0), (0, 0)])
+        reference = jnp.where((cosine < OPPOSITE_COSINE)[:, None], about, shortest)
+        # of f⁻¹ g s⁻¹ the real part is g · f s, and that along a is g · f (0, a) s
+        there = multiply_quaternions(list(first[3:, None]), list(reference))
+        w, s = dot_components(list(second[3:, None]), there)
         return jnp.arctan2(2.0 * s * w, w * w - s * s)
 
     def find_normals(self, axis: Array) -> list[Array]:
-        """Two directions across an axis `(3, joints, 1)` and each other."""
-        a = _normalise(axis)
-        smallest = jnp.argmin(jnp.abs(a), axis=0)
-        other = jnp.stack([(smallest == i).astype(a.dtype) for i in range(3)])
-        first = _normalise(_cross(a, other))
-        return [first, _cross(a, first)]
+        """Two directions across unit vectors `(3, joints, 1)`, and across each other."""
+        places = jnp.arange(3).reshape(3, *[1] * (axis.ndim - 1))
+        e = (jnp.argmin(jnp.abs(axis), axis=0, keepdims=True) == places).astype(axis.dtype)
+        # a × e of length √(1 - (a·e)²), and a × (a × e) = (a·e) a - e
+        along = jnp.sum(axis * e, axis=0, keepdims=True)
+        inverse = 1.0 / jnp.sqrt(1.0 - along * along)
+        return [cross_rows(axis, e) * inverse, (along * axis - e) * inverse]
 
 
 BodyCoordinates = PlanarCoordinates | SpatialCoordinates
@@ -207,19 +219,29 @@ def choose_coordinates(name: str, state: PyTree) -> BodyCoordinates:
     )
 
 
-def _dot(a: Array | list[Array], b: Array | list[Array]) -> Array:
-    """The scalar product of vectors in space, in components."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _find_rotation(turn: Array) -> Array:
+    """The rotation matrices of quaternions `(4, *rest)`: rows and columns in front."""
+    axes = jnp.eye(3, dtype=turn.dtype).reshape(3, 3, *[1] * (turn.ndim - 1))
+    return jnp.stack(rotate_components(list(turn[:, None]), list(axes)))
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Their vector product."""
-    return jnp.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
+def dot_components(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    """The scalar product of vectors in components."""
+    total = a[0] * b[0]
+    for p, q in zip(a[1:], b[1:], strict=True):
+        total = total + p * q
+    return total
 
 
-def _normalise(vectors: Array) -> Array:
-    """Vectors `(dim, joints, 1)` of length 1."""
+def normalise(vectors: Array) -> Array:
+    """Vectors `(dim, *rest)` of length 1."""
     return vectors / jnp.sqrt(jnp.sum(vectors * vectors, axis=0, keepdims=True))
+
+
+def cross_rows(a: Array, b: Array) -> Array:
+    """The vector product of vectors in space `(3, *rest)`."""
+    p, q = jnp.split(a, 3), jnp.split(b, 3)
+    return jnp.concatenate([p[i - 2] * q[i - 1] - p[i - 1] * q[i - 2] for i in range(3)])
 
 
 def _join(*parts: Array) -> Array:
@@ -228,4 +250,12 @@ def _join(*parts: Array) -> Array:
     return jnp.concatenate([jnp.broadcast_to(part, (part.shape[0], *rest)) for part in parts])
 
 
-__all__ = ["BodyCoordinates", "PlanarCoordinates", "SpatialCoordinates", "choose_coordinates"]
+__all__ = [
+    "BodyCoordinates",
+    "PlanarCoordinates",
+    "SpatialCoordinates",
+    "choose_coordinates",
+    "cross_rows",
+    "dot_components",
+    "normalise",
+]

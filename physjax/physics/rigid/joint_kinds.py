@@ -21,9 +21,9 @@ from physjax.constraints.ranges import Bounds, Rows, spread_bounds
 from physjax.physics.rigid.body_joints import (
     BodyJoints,
     check_joints,
-    dot_components,
     subtract_points,
 )
+from physjax.physics.rigid.joint_coordinates import dot_components
 from physjax.physics.rigid.turns import measure_turn, remember_turns
 
 

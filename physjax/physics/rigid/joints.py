@@ -25,13 +25,13 @@ from physjax.physics.rigid.body_joints import (
     BodyJoints,
     as_axes,
     check_joints,
-    differentiate_cosine,
     differentiate_rows,
-    dot_components,
     read_bodies,
+    subtract_arms,
     subtract_points,
 )
 from physjax.physics.rigid.inertia import Inertia
+from physjax.physics.rigid.joint_coordinates import cross_rows, normalise
 from physjax.physics.rigid.planar.bodies import PlanarBodies
 from physjax.physics.rigid.spatial import RigidBodies, Wrench, angular_velocity
 from physjax.vectors import broadcast_vector, cross, dot, norm, rotate_vector, scale
@@ -139,26 +139,27 @@ class Joints(BodyJoints):
 
     def measure(self, first: Places, second: Places) -> Float[Array, "rows joints worlds"]:
         """From the first point to the second [m], and the cosine of the angle between the axes."""
-        rows = subtract_points(self.place_ends(first, second))
-        return jnp.stack(rows if self.axis is None else [*rows, dot_components(*self._turn_axes(first, second))])
+        if self.points.shape[-1] == 2:
+            return jnp.stack(subtract_points(self.place_ends(first, second)))
+        arms, axes = self.turn_ends(first, second, self._find_axes())
+        return self._stack_rows(first, second, arms, axes)
 
     def differentiate(self, reader: Coordinates, first: Places, second: Places) -> tuple[Rows, PushedRows, PushedRows]:
         """The rows and their change with moves of either end, in space in closed form."""
         if self.points.shape[-1] == 2:
             return super().differentiate(reader, first, second)
-        ends, angles = self.place_ends(first, second), []
-        rows = subtract_points(ends)
-        if self.axis is not None:
-            axes = self._turn_axes(first, second)
-            rows.append(dot_components(*axes))
-            angles.append(differentiate_cosine(*axes))
-        return jnp.stack(rows), *differentiate_rows(ends, (first, second), angles)
+        arms, axes = self.turn_ends(first, second, self._find_axes())
+        across = None if self.axis is None else cross_rows(axes[:, 0], axes[:, 1])
+        return self._stack_rows(first, second, arms, axes), *differentiate_rows(arms, across)
 
-    def _turn_axes(self, first: Places, second: Places) -> tuple[list[Array], list[Array]]:
-        """The axes of both bodies of each joint in the world frame."""
-        axes = jnp.moveaxis(jnp.asarray(self.axis), 0, 2)[..., None]
-        a, b = axes / jnp.sqrt(jnp.sum(axes * axes, axis=1, keepdims=True))
-        return self.reader.turn(first, a), self.reader.turn(second, b)
+    def _find_axes(self) -> Array | None:
+        """The directions of the axes of both bodies of each joint, `(3, 2, 1, joints, 1)`."""
+        return None if self.axis is None else normalise(jnp.transpose(self.axis)[:, :, None, :, None])
+
+    def _stack_rows(self, first: Places, second: Places, arms: Array, axes: Array) -> Rows:
+        """The rows in space, given what is turned with the bodies."""
+        apart = subtract_arms(first, second, arms)
+        return apart if self.axis is None else jnp.concatenate([apart, jnp.sum(axes[:, 0] * axes[:, 1], axis=0)])
 
     def prepare(self, state: PyTree, mass: PyTree) -> Self:
         """The joints as part of a scene; exact ones are closed at its start."""
