@@ -144,3 +144,12 @@ def test_the_pace_of_a_car_can_be_differentiated_by_the_torque_of_its_motors():
     _, slope = jax.jvp(pace, (jnp.asarray(1.0),), (jnp.asarray(1.0),))
     np.testing.assert_allclose(slope, (pace(1.01) - pace(0.99)) / 0.02, rtol=1e-4)
     np.testing.assert_allclose(slope, 2 / 0.3 / 33.0 * 0.5, rtol=1e-3)
+
+
+def test_joints_hold_solids_that_nothing_can_touch():
+    plate = inertia.planar_plate(1.0, (0.2, 0.2))
+    pin = rigid.Joints([(-1, 0)], [[[0.0, 0.0], [0.0, 0.5]]])
+    solids = rigid.Solids(rigid.PlanarShape.box((0.2, 0.2)), pairs=np.zeros((0, 2), int))
+    start = rigid.planar_bodies(plate, [[0.0, -0.5]])
+    film = simulate(Scene(start, plate, (forces.Gravity(), pin), (solids,)), methods.leapfrog, dt=1 / 60, steps=10)
+    np.testing.assert_allclose(film.position[-1, 0], [0.0, -0.5], atol=1e-12)

@@ -90,7 +90,7 @@ class Links(NamedTuple):
         return both[0], both[1]
 
     def _take_blocks(self, rows: np.ndarray, columns: np.ndarray) -> Array:
-        """`(turns, freedoms, freedoms, width, worlds)`"""
+        """What joints add to these bodies of contacts where those change by 1, `(turns, freedoms, freedoms, width, worlds)`."""
         padded = jnp.pad(self.response, ((0, 0), (0, 1), (0, 0), (0, 1), (0, 0)))
         size, worlds = len(self.turns.joined) + 1, padded.shape[-1]
         flat = jnp.transpose(padded, (0, 2, 1, 3, 4)).reshape(len(padded), len(padded), size * size, worlds)
@@ -98,9 +98,9 @@ class Links(NamedTuple):
 
 
 def plan_turns(scene: Scene, groups: Groups) -> Turns | None:
-    """The turns in which the contacts of a scene are solved; None where nothing that touches is joined."""
+    """The turns in which the contacts of a scene are solved; None without contacts, or joints that hold."""
     held = tuple(pair for part in find_constraints(scene) if part.rows > part.bounded for pair in part.pairs)
-    if not held:
+    if not held or not groups.is_contact.any():
         return None
     return _plan_turns(held, *_freeze(groups))
 

@@ -54,6 +54,8 @@ def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scen
             f"contacts: got {1 + len(others)} Solids, expected one: it holds all bodies, shapes= one for each, and all surfaces."
         )
     solids: Any = scene.contacts[number]
+    if not solids.pairs and not solids.surfaces:
+        return motion(scene, t, dt)
     dt = jnp.asarray(dt, scene.state.dtype)
     h = dt / solids.substeps
     world = build_world(solids, scene, h)
