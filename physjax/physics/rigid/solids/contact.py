@@ -55,7 +55,7 @@ class Solids(Contact):
     is several bodies held together by `rigid.Welds`.
 
     Bodies in exact joints move as these let them where a contact pushes one of them: light wheels carry a heavy car, and what is
-    welded together bounces as one body. Limits and motors answer a contact in the next sub-step.
+    welded together bounces as one body. Limits and motors react to a contact in the next sub-step.
 
     It remembers the `impulses` of contacts, `(*worlds, numbers, groups, size)`, with which the next step begins, and where
     bodies are joined the `loads` of contacts on each of them in the mean of the last step, `(*worlds, bodies, 3 or 6)`, force [N]

@@ -64,7 +64,7 @@ class _Scene(NamedTuple):
     response: Response | None
 
     def find_links(self, all_worlds: Links | None) -> Links | None:
-        """How joints answer in these worlds."""
+        """How joints react in these worlds."""
         return None if all_worlds is None or self.response is None else all_worlds._replace(response=self.response)
 
 

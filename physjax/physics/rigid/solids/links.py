@@ -48,18 +48,18 @@ class Turns(NamedTuple):
 
 
 class Links(NamedTuple):
-    """The turns of contacts, and how joints answer them in some worlds."""
+    """The turns of contacts, and how joints react to them in some worlds."""
 
     turns: Turns
     response: Response
 
-    def answer_all(self, velocity: Velocity) -> Velocity:
+    def add_reactions(self, velocity: Velocity) -> Velocity:
         """Velocities of bodies `(..., bodies, worlds)` that impulses alone have changed, with what joints add."""
         joined = self.turns.joined
         change = flatten(velocity)[:, joined]
         return self.add(velocity, jnp.sum(self.response * change[None, None], axis=(2, 3)))
 
-    def answer(self, columns: Sides, changes: tuple[Velocity, Velocity]) -> Array:
+    def find_reaction(self, columns: Sides, changes: tuple[Velocity, Velocity]) -> Array:
         """What joints add to the velocities of the joined bodies where contacts of a turn change both of theirs."""
         total = jnp.zeros((), self.response.dtype)
         for column, change in zip(columns, changes, strict=True):
@@ -106,7 +106,7 @@ def plan_turns(scene: Scene, groups: Groups) -> Turns | None:
 
 
 def find_links(turns: Turns, scene: Scene) -> Links:
-    """How the joints of a scene answer changes of velocities, where its bodies are now."""
+    """How the joints of a scene react to changes of velocities, where its bodies are now."""
     mechanism = Mechanism.of(scene)
     coordinates, joined = mechanism.coordinates, turns.joined
     places = coordinates.read_places(scene.state)

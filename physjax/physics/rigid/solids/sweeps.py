@@ -53,7 +53,7 @@ def sweep_contacts(
             for rows, end, more in zip((a, b), ends, change, strict=True):
                 write = lambda part, e, m, rows=rows: part.at[..., rows, :].set(e + m, unique_indices=True)  # noqa: E731
                 after = map_components(write, after, end, more)
-            return after if links is None else links.add(after, links.answer(columns, change)), new
+            return after if links is None else links.add(after, links.find_reaction(columns, change)), new
 
         if links is None:
             return act()
@@ -108,7 +108,7 @@ def sum_impulses(
         return jnp.moveaxis(jnp.dot(matrix, flat, precision=lax.Precision.HIGHEST), 0, -2)
 
     total = map_components(lambda a, b: gather(on_a, a) + gather(on_b, b), of_a, of_b)
-    return total if links is None else links.answer_all(total)
+    return total if links is None else links.add_reactions(total)
 
 
 __all__ = ["measure_openings", "measure_several", "sum_impulses", "sweep_contacts"]
