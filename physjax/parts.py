@@ -253,6 +253,10 @@ class Contact(Module):
         """What it exerted on the bodies in the mean of the last step, `(*lanes, freedoms)` [N, N m], where it knows."""
         return None
 
+    def find_pushes(self) -> Array | None:
+        """What it is expected to exert on joined bodies in this step, `(freedoms, bodies, worlds)` [N, N m]."""
+        return None
+
     def forget_lanes(self, lanes: Bool[Array, "*lanes"]) -> "Contact":
         """The contact with the memory of some lanes cleared, because other particles take their place."""
         return self

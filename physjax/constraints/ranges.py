@@ -46,6 +46,12 @@ class Bounds(NamedTuple):
         aim = self.goal + lag * jnp.exp(-self.gain * h) + self.speed * h
         return Range(self.low, self.high, aim, 0.5 * h * self.cap, jnp.zeros_like(x))
 
+    def find_held(self, before: Rows, x: Rows, h: Float[Array, " worlds"], near: Float[Array, " worlds"]) -> Array:
+        """Which rows a step of h [s] has left where they are held, at a limit or at their aim, or no more than `near` from it."""
+        aim = jnp.clip(self.after(before, h).aim, self.low, self.high)
+        at = lambda target: jnp.abs(x - target) <= near[None, None]  # noqa: E731
+        return (self.low == self.high) | at(self.low) | at(self.high) | ((self.cap > 0) & at(aim))
+
     def speeds(self, x: Rows, h: Float[Array, " worlds"], near: Float[Array, " worlds"]) -> "Range":
         """At which speeds a row may change, which is at its limit where it is no more than `near` from it."""
         low, high = self._open(x, near, True)

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
 from physjax.constraints.constraint import Constraint
-from physjax.constraints.coordinates import Places
+from physjax.constraints.coordinates import Moves, Places
 from physjax.constraints.impulses import ClosingStep, close_joints
 from physjax.constraints.mechanism import Jacobian, Mechanism, find_constraints, hold_rows
 from physjax.constraints.ranges import Range, Rows, Steps, are_held, change_steps
@@ -60,7 +60,8 @@ def hold_joints(motion: Callable, scene: Scene, t: Time, dt: ArrayLike) -> Scene
 class _Start(NamedTuple):
     """What a step begins with: the mechanism, its Jacobian and M⁻¹Jᵀ at the start, and the length of the step of each world.
 
-    `x` are the numbers of its rows, `allowed` what they may be at the end; None where all are held at zero.
+    `pushed` are the impulses of contacts on the bodies `(freedoms, bodies, worlds)` in half of the step, as far as they are
+    expected. `x` are the numbers of its rows, `allowed` what they may be at the end; None where all are held at zero.
     """
 
     mechanism: Mechanism
@@ -69,6 +70,7 @@ class _Start(NamedTuple):
     mobility: Array
     h: Float[Array, " worlds"]
     tolerance: Float[Array, " worlds"]
+    pushed: Moves | None
     x: Rows
     allowed: Range | None
 
@@ -100,6 +102,8 @@ def _take_step(motion: Callable, scene: Scene, t: Time, dt: Array) -> Scene:
     _, gap, (end, _) = close_joints(step, none)
     good = jnp.max(jnp.abs(gap), axis=(0, 1)) <= start.tolerance * float(jnp.finfo(gap.dtype).eps) ** -0.25
     end = _keep_worlds(end, good)
+    if start.pushed is not None:
+        end = mechanism.coordinates.push(end, mass, start.pushed)
     return scene.replace(state=stop_opening(mechanism, scene, end, TOUCHING * start.tolerance, start.h))
 
 
@@ -123,13 +127,19 @@ def _begin(scene: Scene, dt: Array) -> _Start:
     if bounds is not None:
         scale = lax.stop_gradient(h[None, None] * mechanism.measure_mobilities(jacobian, moved))
         allowed = bounds.after(x, h)._replace(scale=scale)
-    return _Start(mechanism, jacobian, moved, mobility, h, mechanism.measure_tolerance(places, mobility), x, allowed)
+    pushes = [push for push in (contact.find_pushes() for contact in scene.contacts) if push is not None]
+    pushed = 0.5 * h[None, None] * mechanism.free[None] * sum(pushes) if pushes else None
+    tolerance = mechanism.measure_tolerance(places, mobility)
+    return _Start(mechanism, jacobian, moved, mobility, h, tolerance, pushed, x, allowed)
 
 
 def _push(start: _Start, scene: Scene, λ: Rows) -> PyTree:
-    """The state at the start with impulses along the joints."""
+    """The state at the start with impulses along the joints, and those of contacts."""
     mechanism = start.mechanism
-    return mechanism.coordinates.push(scene.state, scene.mass, mechanism.sum_at_bodies(start.jacobian, λ))
+    impulses = mechanism.sum_at_bodies(start.jacobian, λ)
+    if start.pushed is not None:
+        impulses = impulses + start.pushed
+    return mechanism.coordinates.push(scene.state, scene.mass, impulses)
 
 
 def _correct(start: _Start, drift: Callable[[Rows], Places], λ: Rows, taken: tuple[PyTree, Rows]) -> Rows:

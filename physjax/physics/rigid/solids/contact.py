@@ -55,7 +55,8 @@ class Solids(Contact):
     is several bodies held together by `rigid.Welds`.
 
     Bodies in exact joints move as these let them where a contact pushes one of them: light wheels carry a heavy car, and what is
-    welded together bounces as one body. Limits and motors react to a contact in the next sub-step.
+    welded together bounces as one body. So do limits that are met and drives at their aim, which give way where contacts pull
+    or push too hard: known after a sub-step, and from impacts after the next.
 
     It remembers the `impulses` of contacts, `(*worlds, numbers, groups, size)`, with which the next step begins, and where
     bodies are joined the `loads` of contacts on each of them in the mean of the last step, `(*worlds, bodies, 3 or 6)`, force [N]
@@ -81,6 +82,7 @@ class Solids(Contact):
     restitution: Numbers = quantity("restitution K_r", "1", per=None, at_least=0, at_most=1, default=0.0)
     impulses: Array | None = unchecked_quantity("impulses", "N s", per="memory", default=None)
     loads: Array | None = unchecked_quantity("loads", "N or N m", per="memory", default=None)
+    pushes: Array | None = unchecked_quantity("pushes", "N or N m", per=None, default=None)
 
     def __init__(
         self,
@@ -98,7 +100,7 @@ class Solids(Contact):
         self.coulomb = coulomb
         self.pairs = None if pairs is None else _as_tuples(np.asarray(pairs))
         self.substeps = as_positive_integer("substeps", substeps)
-        self.impulses = self.loads = None
+        self.impulses = self.loads = self.pushes = None
 
     def __check_init__(self):
         in_space = bool(self.shapes) and isinstance(self.shapes[0], Shape)
@@ -181,6 +183,10 @@ class Solids(Contact):
     def find_loads(self) -> Array | None:
         """What contacts exerted on the bodies in the mean of the last step, zero where none are joined."""
         return self.loads
+
+    def find_pushes(self) -> Array | None:
+        """What contacts are expected to exert within a step that is being taken."""
+        return self.pushes
 
     def prepare(self, state: Any, couples: bool) -> "Solids":
         """The contact with its pairs listed and no impulses yet."""

@@ -3,9 +3,13 @@
 Joints leave of a change u of velocities the part P u, with P = 1 - M⁻¹Jᵀ(J M⁻¹ Jᵀ)⁻¹J. Contacts are solved with bodies that
 move so. Solved for free bodies, and the joints closed after them, a contact takes what the mass of the body that it touches
 needs: a car of 100 kg on wheels of 1 kg would sink into the road.
+
+A limit that is met, and a drive that is at its aim, hold like joints. Which do is known once the step of the joints is taken,
+with what contacts are expected to exert: a servo that their load overpowers gives way, and so does a limit from which they
+pull. In an impact, which takes no time, drives exert nothing, and what a limit does is left to the step after it.
 """
 
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -14,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from physjax.constraints.elimination import Pairs
-from physjax.constraints.mechanism import Mechanism, find_constraints, hold_rows
+from physjax.constraints.mechanism import Jacobian, Mechanism, find_constraints, hold_rows
+from physjax.constraints.reactions import TOUCHING
 from physjax.physics.rigid.solids.mechanics import Sides, Velocity
 from physjax.physics.rigid.solids.pairs import Groups, part_contacts
 from physjax.scene import Scene
@@ -48,10 +53,15 @@ class Turns(NamedTuple):
 
 
 class Links(NamedTuple):
-    """The turns of contacts, and how joints react to them in some worlds."""
+    """The turns of contacts, and how joints react to them in some worlds; `at_impacts` otherwise than else, None: as else."""
 
     turns: Turns
     response: Response
+    at_impacts: Response | None = None
+
+    def take_impacts(self) -> "Links":
+        """How joints react to impacts."""
+        return self if self.at_impacts is None else Links(self.turns, self.at_impacts)
 
     def add_reactions(self, velocity: Velocity) -> Velocity:
         """Velocities of bodies `(..., bodies, worlds)` that impulses alone have changed, with what joints add."""
@@ -99,41 +109,50 @@ class Links(NamedTuple):
 
 def plan_turns(scene: Scene, groups: Groups) -> Turns | None:
     """The turns in which the contacts of a scene are solved; None without contacts, or joints that hold."""
-    held = tuple(pair for part in find_constraints(scene) if part.rows > part.bounded for pair in part.pairs)
-    if not held or not groups.is_contact.any():
+    pairs = tuple(pair for part in find_constraints(scene) for pair in part.pairs)
+    if not pairs or not groups.is_contact.any():
         return None
-    return _plan_turns(held, *_freeze(groups))
+    return _plan_turns(pairs, *_freeze(groups))
 
 
-def find_links(turns: Turns, scene: Scene) -> Links:
-    """How the joints of a scene react to changes of velocities, where its bodies are now."""
+def find_links(turns: Turns, scene: Scene, moved: Any, h: Array) -> Links:
+    """How the joints of a scene react to changes of velocities, given the state a time h [s] later if nothing touches."""
     mechanism = Mechanism.of(scene)
-    coordinates, joined = mechanism.coordinates, turns.joined
+    coordinates = mechanism.coordinates
     places = coordinates.read_places(scene.state)
     jacobian, x = mechanism.differentiate(places)
-    bounds = mechanism.find_bounds(x)
-    if bounds is not None:
-        # what has some play, or is driven, is not held
-        jacobian = hold_rows(jacobian, bounds.low == bounds.high)
     mobility = coordinates.read_mobility(scene.state, scene.mass)
+    respond = partial(_find_response, turns.joined, mechanism, mobility)
+    bounds = mechanism.find_bounds(x)
+    if bounds is None:
+        return Links(turns, respond(jacobian))
+    near = TOUCHING * mechanism.measure_tolerance(places, mobility)
+    later = mechanism.measure(coordinates.read_places(moved), x)
+    holds = jnp.stack([bounds.find_held(x, later, h, near), bounds.low == bounds.high])
+    response, at_impacts = jax.vmap(lambda held: respond(hold_rows(jacobian, held)))(holds)
+    return Links(turns, response, at_impacts)
+
+
+def _find_response(joined: np.ndarray, mechanism: Mechanism, mobility: Array, jacobian: Jacobian) -> Response:
+    """What the rows of a Jacobian, none of which may change, add where a contact alone changes velocities by 1."""
     matrix = mechanism.build_matrix(jacobian, mechanism.move_by_impulses(mobility, jacobian))
-    freedoms, bodies = coordinates.freedoms, len(mechanism.free)
+    freedoms, bodies = mechanism.coordinates.freedoms, len(mechanism.free)
     one = np.eye(freedoms * bodies).reshape(freedoms, bodies, freedoms, bodies)[:, joined]
 
     def respond(change: Array) -> Array:
-        change = jnp.broadcast_to(change[..., None], (freedoms, *mechanism.free.shape)).astype(x.dtype)
+        change = jnp.broadcast_to(change[..., None], (freedoms, *mechanism.free.shape)).astype(jacobian.dtype)
         λ = mechanism.solve(matrix, -mechanism.measure_rates(jacobian, change))
         return mechanism.change_rates(mobility, jacobian, λ)[:, joined]
 
-    found = jax.vmap(jax.vmap(respond))(jnp.asarray(one, x.dtype))
-    return Links(turns, jnp.moveaxis(found, (0, 1), (2, 3)))
+    found = jax.vmap(jax.vmap(respond))(jnp.asarray(one, jacobian.dtype))
+    return jnp.moveaxis(found, (0, 1), (2, 3))
 
 
 @cache
-def _plan_turns(held: Pairs, contact: tuple, a: tuple, b: tuple, bodies: int) -> Turns:
+def _plan_turns(pairs: Pairs, contact: tuple, a: tuple, b: tuple, bodies: int) -> Turns:
     """The same, of what can be looked up."""
-    joined = np.array(sorted({body for pair in held for body in pair if body >= 0}))
-    mechanism = _name_mechanisms(held, bodies)
+    joined = np.array(sorted({body for pair in pairs for body in pair if body >= 0}))
+    mechanism = _name_mechanisms(pairs, bodies)
     flat = [np.array(table).ravel() for table in (contact, a, b)]
     there = np.flatnonzero(flat[1] < bodies)
     moves = [tuple({mechanism[row] for row in (p, q) if row < bodies}) for p, q in zip(*flat[1:], strict=True)]
@@ -161,10 +180,10 @@ def _freeze(groups: Groups) -> tuple[Any, ...]:
     return (*tables, groups.rows - 2 * groups.size)
 
 
-def _name_mechanisms(held: Pairs, bodies: int) -> list[int]:
+def _name_mechanisms(pairs: Pairs, bodies: int) -> list[int]:
     """For each body the first of all that it is joined to, over several joints; its own number where it is free."""
     names = list(range(bodies))
-    for a, b in held:
+    for a, b in pairs:
         if a >= 0 and b >= 0:
             kept, lost = sorted((names[a], names[b]))
             names = [kept if name == lost else name for name in names]

@@ -16,9 +16,10 @@ from jaxtyping import Array
 
 from physjax.backend import materialise
 from physjax.compaction import map_worlds
+from physjax.constraints.mechanism import find_constraints
 from physjax.loops import Time, to_float_time
 from physjax.physics.rigid.solids.impacts import ROUNDING, Bouncing, resolve_impacts
-from physjax.physics.rigid.solids.links import Links, find_links, flatten, plan_turns
+from physjax.physics.rigid.solids.links import Turns, find_links, flatten, plan_turns
 from physjax.physics.rigid.solids.mechanics import (
     SOFT,
     Demand,
@@ -60,15 +61,20 @@ def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scen
     h = dt / solids.substeps
     world = build_world(solids, scene, h)
     turns = plan_turns(scene, world.groups)
+    driven = turns is not None and any(part.bounded for part in find_constraints(scene))
     memory = jnp.moveaxis(solids.impulses.reshape(-1, *solids.impulses.shape[-3:]), 0, -1)
 
     def take(carry: tuple[Any, Kept], substep: Array) -> tuple[tuple[Any, Kept], Array | None]:
         state, kept = carry
         start = t + substep.astype(h.dtype) * h
-        now = scene.replace(state=state)
+        now, joined, ahead, at = scene.replace(state=state), world, None, to_float_time(start)
+        if turns is not None and driven:
+            ahead, pushes = _look_ahead(world, turns, now, kept, at)
+            now = _replace_solids(now, number, pushes=pushes)
         moved = motion(now, start, h).state
-        joined = world if turns is None else world._replace(links=find_links(turns, now))
-        after, kept, loads = _take_substep(joined, scene, (state, moved), kept, to_float_time(start), h)
+        if turns is not None:
+            joined = world._replace(links=find_links(turns, now, moved, world.substep.reshape(-1)))
+        after, kept, loads = _take_substep(joined, scene, (state, moved), (kept, ahead), at, h)
         return (after, kept), loads
 
     begun, substeps = (scene.state, world.mechanics.unpack(memory)), jnp.arange(solids.substeps, dtype=jnp.int32)
@@ -77,13 +83,42 @@ def solve_contacts(motion: Motion, scene: Scene, t: Time, dt: ArrayLike) -> Scen
     exerted = (
         solids.loads if loads is None else jnp.transpose(jnp.mean(loads, axis=0), (2, 1, 0)).reshape(solids.loads.shape)
     )
+    return _replace_solids(scene.replace(state=state), number, impulses=after, loads=exerted)
+
+
+def _replace_solids(scene: Scene, number: int, **parts: Array) -> Scene:
+    """The scene with other arrays of the solids among its contacts."""
+    where = lambda solids: [getattr(solids, name) for name in parts]  # noqa: E731
     contacts = list(scene.contacts)
-    contacts[number] = eqx.tree_at(lambda solids: (solids.impulses, solids.loads), solids, (after, exerted))
-    return scene.replace(state=state, contacts=tuple(contacts))
+    contacts[number] = eqx.tree_at(where, contacts[number], [*parts.values()], is_leaf=lambda leaf: leaf is None)
+    return scene.replace(contacts=tuple(contacts))
+
+
+class _Ahead(NamedTuple):
+    """What is known of a sub-step before it is taken: contacts in turns, and the impulses with which they begin."""
+
+    touching: Touching
+    held: Impulses
+
+
+def _look_ahead(world: World, turns: Turns, scene: Scene, kept: Kept, t: ArrayLike) -> tuple[_Ahead, Array]:
+    """Contacts at the start of a sub-step, and what they are expected to exert on bodies `(freedoms, bodies, worlds)` [N, N m].
+
+    Limits and drives of joints, which yield, have to know it.
+    """
+    mechanics = world.mechanics
+    touching = mechanics.find_contacts(world, mechanics.read_pose(scene.state, scene).place, t)
+    touching, kept = _arrange(turns, touching, kept)
+    # every world has numbers of its own, as those have who are taken some at a time
+    touching = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], world.worlds)), touching)
+    held = materialise(t, lambda: jax.vmap(mechanics.recall)(kept, touching.contacts))
+    incidence = world.take_turns(turns).incidence
+    pushes = flatten(sum_impulses(mechanics, mechanics.free(touching.contacts), held, incidence, None))
+    return _Ahead(touching, held), 2 * pushes / world.substep.reshape(1, 1, -1)
 
 
 def _take_substep(
-    world: World, scene: Scene, states: tuple[Any, Any], kept: Kept, t: ArrayLike, h: Array
+    world: World, scene: Scene, states: tuple[Any, Any], known: tuple[Kept, _Ahead | None], t: ArrayLike, h: Array
 ) -> tuple[Any, Kept, Array | None]:
     """What a sub-step carries on, given the state at its start and where the method alone would bring it, and loads of joints."""
     mechanics = world.mechanics
@@ -93,11 +128,12 @@ def _take_substep(
     start, moved = materialise(t, lambda: tuple(mechanics.read_pose(state, scene) for state in states))
     way = _Way(start, mechanics.find_mean_rate(start, moved, h), moved.rate, h)
 
-    def hold(some: tuple[tuple, _Way, Kept]) -> tuple[Velocity, Velocity, Kept, Array | None]:
-        of_worlds, way, kept = some
-        return _hold(world.with_bodies(*of_worlds), way, kept, t)
+    def hold(some: tuple[tuple, _Way, Kept, _Ahead | None]) -> tuple[Velocity, Velocity, Kept, Array | None]:
+        of_worlds, way, kept, ahead = some
+        return _hold(world.with_bodies(*of_worlds), way, kept, ahead, t)
 
-    some = (world.mass, world.turning, None if world.links is None else world.links.response), way, kept
+    responses = None if world.links is None else (world.links.response, world.links.at_impacts)
+    some = (world.mass, world.turning, responses), way, *known
     # worlds with steps of their own have times of their own, and surfaces may move with these
     together = jnp.ndim(t) == 0 and world.substep.ndim == 0
     places, rates, kept, loads = map_worlds(hold, some, world.worlds, world.groups.size) if together else hold(some)
@@ -113,15 +149,34 @@ class _Way(NamedTuple):
     h: Array
 
 
-def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, Velocity, Kept, Array | None]:
+def _hold(
+    world: World, way: _Way, kept: Kept, ahead: _Ahead | None, t: ArrayLike
+) -> tuple[Velocity, Velocity, Kept, Array | None]:
     """How much further bodies are [m, rad] and how much faster at the end than if nothing touched, and what is kept.
 
     Where bodies are joined, also what contacts have exerted on each in the mean [N, N m], `(freedoms, bodies, worlds)`.
     """
-    mechanics, (start, mean, end, h) = world.mechanics, way
-    touching = mechanics.find_contacts(world, start.place, t)
-    if world.links is not None:
-        world, touching, kept = _take_turns(world, world.links, touching, kept)
+    mechanics, (start, mean, end, h), links = world.mechanics, way, world.links
+    if ahead is not None:
+        touching = ahead.touching
+    else:
+        touching = mechanics.find_contacts(world, start.place, t)
+        if links is not None:
+            touching, kept = _arrange(links.turns, touching, kept)
+    struck = held_apart = touching.contacts
+    if links is not None:
+        world = world.take_turns(links.turns)
+        struck = held_apart = mechanics.link(touching.contacts, links.take_impacts().spread)
+        if links.at_impacts is not None:
+            held_apart = mechanics.link(touching.contacts, links.spread)
+    recall = lambda: materialise(t, lambda: jax.vmap(mechanics.recall)(kept, held_apart))  # noqa: E731
+    held = recall() if ahead is None else ahead.held
+    touching = touching._replace(contacts=held_apart)
+    push = sum_impulses(mechanics, touching.contacts, held, world.incidence, links)
+    moved = mean, end
+    if ahead is not None:
+        # the step of the joints was taken with what they begin with
+        mean, end = (map_components(lambda v, p, n=n: v - n * p, rates, push) for n, rates in ((1, mean), (2, end)))
     changes = map_components(lambda now, after: jnp.abs(after - now), start.rate, end)
     if touching.carried_at_end is not None:
         # as forces do, surfaces change speeds: by twice as much in a sub-step as in half of it
@@ -130,43 +185,39 @@ def _hold(world: World, way: _Way, kept: Kept, t: ArrayLike) -> tuple[Velocity, 
     slow = REST_SPEED_STEPS * find_largest(changes[: mechanics.straight])
     before = world.pad_all(start.rate)
     speeds = measure_several(mechanics, (before, world.pad_all(mean)), world.groups, touching.contacts)
-    touching = _stick(world, touching, speeds[0], start.rate, slow)
-    held = materialise(t, lambda: jax.vmap(mechanics.recall)(kept, touching.contacts))
-    bounced, hits = _bounce(world, touching, (before, held), speeds, slow, h)
+    friction = _stick(world, touching.contacts, speeds[0], start.rate, slow)
+    touching = touching._replace(contacts=touching.contacts._replace(friction=friction))
+    struck = touching._replace(contacts=struck._replace(friction=friction))
+    bounced, hits = _bounce(world, struck, (before, held), speeds, slow, h)
     bounced = world.cut_all(bounced)
     impact = map_components(jnp.subtract, bounced, start.rate)
     bounced = map_components(jnp.add, mean, impact), map_components(jnp.add, end, impact)
-    moves, impulses, total = _hold_apart(world, touching, bounced, held, h)
-    ways, rates = (
-        map_components(jnp.subtract, after, before) for after, before in zip(moves, (mean, end), strict=True)
-    )
+    moves, impulses, total = _hold_apart(world, touching, bounced, (held, push), h)
+    ways, rates = (map_components(jnp.subtract, after, before) for after, before in zip(moves, moved, strict=True))
     places = map_components(lambda part: by_world(h[0], part) * part, ways)
     kept = jax.vmap(mechanics.keep)(impulses, touching.contacts)
-    if world.links is None:
+    if links is None:
         return places, rates, kept, None
     exerted = map_components(jnp.add, hits, total)
     loads = sum_impulses(mechanics, mechanics.free(touching.contacts), exerted, world.incidence, None)
-    return places, rates, world.links.turns.restore(kept), flatten(loads) / h[None]
+    return places, rates, links.turns.restore(kept), flatten(loads) / h[None]
 
 
-def _take_turns(world: World, links: Links, touching: Touching, kept: Kept) -> tuple[World, Touching, Kept]:
-    """Contacts in turns, with bodies that move as joints let them."""
-    contacts, gap, carried_at_end, kept = links.turns.arrange(
+def _arrange(turns: Turns, touching: Touching, kept: Kept) -> tuple[Touching, Kept]:
+    """Contacts, and what was kept of them, in turns."""
+    contacts, gap, carried_at_end, kept = turns.arrange(
         (touching.contacts, touching.gap, touching.carried_at_end, kept)
     )
-    touching = Touching(world.mechanics.link(contacts, links.spread), gap, touching.points, carried_at_end)
-    return world.take_turns(links), touching, kept
+    return Touching(contacts, gap, touching.points, carried_at_end), kept
 
 
-def _stick(world: World, touching: Touching, speeds: Speeds, rate: Velocity, slow: Array) -> Touching:
-    """The contacts with static friction where they do not slip, or so slowly that forces may have just begun it."""
-    contacts, rounding = touching.contacts, ROUNDING * float(jnp.finfo(slow.dtype).eps)
+def _stick(world: World, contacts: Any, speeds: Speeds, rate: Velocity, slow: Array) -> Array:
+    """The friction of contacts, static where they do not slip, or so slowly that forces may have just begun it."""
+    rounding = ROUNDING * float(jnp.finfo(slow.dtype).eps)
     slip = jax.vmap(world.mechanics.find_slip)(speeds, contacts)
     fastest = find_largest([jnp.abs(part) for part in rate[: world.mechanics.straight]])
     sticks = slip <= by_world(slow + rounding * fastest, slip)
-    return touching._replace(
-        contacts=contacts._replace(friction=jnp.where(sticks, world.materials.static, contacts.friction))
-    )
+    return jnp.where(sticks, world.materials.static, contacts.friction)
 
 
 class _Pass(NamedTuple):
@@ -178,7 +229,11 @@ class _Pass(NamedTuple):
 
 
 def _hold_apart(
-    world: World, touching: Touching, velocities: tuple[Velocity, Velocity], held: Impulses, h: Array
+    world: World,
+    touching: Touching,
+    velocities: tuple[Velocity, Velocity],
+    begun: tuple[Impulses, Velocity],
+    h: Array,
 ) -> tuple[tuple[Velocity, Velocity], Impulses, Impulses]:
     """The mean velocities and those at the end after contacts have acted, what is kept of their impulses, and these.
 
@@ -188,8 +243,7 @@ def _hold_apart(
     once, which both have in common. It is what the next sub-step starts with; its impulses at the end start with those that
     it has found in the mean. So errors of a sweep do not feed on themselves; friction alone follows that of the mean a little.
     """
-    (mean, end), (contacts, gap, _, at_end), mechanics = velocities, touching, world.mechanics
-    push = sum_impulses(mechanics, contacts, held, world.incidence, world.links)
+    (mean, end), (held, push), (contacts, gap, _, at_end), mechanics = velocities, begun, touching, world.mechanics
     each, rubbing = by_world(h[0], gap[0]), mechanics.rubbing
 
     def sweep(this: _Pass, carried: tuple[Array, ...] | None) -> tuple[_Pass, tuple[Velocity, Impulses, Points]]:
@@ -238,7 +292,8 @@ def _bounce(
     # forces change by `u - v` how fast the gap closes
     reach = tuple(s / by_world(h[0], s) + (u - v) for s, u, v in zip(touching.gap, middle, now, strict=True))
     bouncing = Bouncing(world.materials.restitution, slow, reach)
-    return resolve_impacts(world.mechanics, bodies, now, world.groups, touching.contacts, bouncing, world.links)
+    links = None if world.links is None else world.links.take_impacts()
+    return resolve_impacts(world.mechanics, bodies, now, world.groups, touching.contacts, bouncing, links)
 
 
 __all__ = ["solve_contacts"]

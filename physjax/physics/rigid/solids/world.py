@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from physjax.physics.contacts.restitution import Coulomb
 from physjax.physics.contacts.surface import Surface
-from physjax.physics.rigid.solids.links import Links, Response
+from physjax.physics.rigid.solids.links import Links, Response, Turns
 from physjax.physics.rigid.solids.mechanics import Mechanics, Sides, Velocity, map_components
 from physjax.physics.rigid.solids.pairs import Groups, group_contacts
 from physjax.scene import Scene
@@ -74,14 +74,13 @@ class World(NamedTuple):
         """Floating-point type of all numbers."""
         return self.mass[0].dtype
 
-    def with_bodies(self, mass: Sides, turning: Any, response: Response | None) -> "World":
+    def with_bodies(self, mass: Sides, turning: Any, responses: tuple[Response, Response | None] | None) -> "World":
         """The same contacts, of some of the worlds."""
-        links = None if self.links is None or response is None else self.links._replace(response=response)
+        links = None if self.links is None or responses is None else Links(self.links.turns, *responses)
         return self._replace(mass=mass, turning=turning, links=links)
 
-    def take_turns(self, links: Links) -> "World":
+    def take_turns(self, turns: Turns) -> "World":
         """The contacts in turns, for what solves them; `mass` and `turning` stay those of the groups."""
-        turns = links.turns
         materials = turns.arrange(self.materials)
         return self._replace(
             groups=turns.groups, materials=materials, incidence=_find_incidence(turns.groups, self.size, self.dtype)
