@@ -84,13 +84,15 @@ Example:
     >>> jet = simulate(spray, methods.verlet, dt=0.1, steps=10)
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from physjax import physics, stepping
 from physjax.checks import quantity
 from physjax.compiling import cache
-from physjax.name_hints import refuse_name
+from physjax.name_hints import refuse_module_name
 from physjax.particles import Particles
 from physjax.parts import Contact, Field, Force
 from physjax.physics import forces
@@ -208,6 +210,9 @@ _LAZY = {
     "sweep": "physjax.study.sweeps.sweep:sweep",
 }
 
+# Folders of modules, whose names are public elsewhere.
+_FOLDERS = ("physics", "show", "stepping", "study")
+
 # `__all__` is taken away once type checkers have read it, so that whoever asks for it comes to `__getattr__`: a star
 # import, `help` and pdoc are about to name everything, and the last two look only at what the module already holds.
 _PUBLIC = __all__
@@ -222,8 +227,15 @@ def __getattr__(name: str) -> object:
         module, _, attribute = _LAZY[name].partition(":")
         found = import_module(module)
         return getattr(found, attribute) if attribute else found
-    raise refuse_name("module 'physjax'", name, __dir__)
+    raise refuse_module_name(__name__, name, _list_names_with_places)
 
 
 def __dir__() -> list[str]:
     return _PUBLIC
+
+
+def _list_names_with_places() -> list[str]:
+    """The public names, and those of the namespaces of functions and parts as `forces.Gravity`; it loads them all."""
+    spaces = {name: getattr(sys.modules[__name__], name) for name in _PUBLIC}
+    spaces = {name: space for name, space in spaces.items() if isinstance(space, ModuleType) and name not in _FOLDERS}
+    return _PUBLIC + [f"{name}.{part}" for name, space in spaces.items() for part in dir(space)]

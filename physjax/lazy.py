@@ -6,7 +6,7 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any
 
-from physjax.name_hints import refuse_name
+from physjax.name_hints import refuse_module_name
 
 
 def serve_submodules(
@@ -18,7 +18,7 @@ def serve_submodules(
     def load(name: str) -> ModuleType:
         if name in names:
             return import_module(f"{package}.{name}")
-        raise refuse_name(f"module {package!r}", name, lambda: names)
+        raise refuse_module_name(package, name, lambda: names)
 
     return names, load, lambda: names
 

@@ -3,12 +3,17 @@
 import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from opcode import opname
+from types import FrameType
 from typing import NamedTuple, NoReturn
 
 MAX_HINTS, MAX_LISTED = 3, 12
 """Names that are suggested at most; where none is near, all are listed unless they are more than the second."""
 CLOSE_SHARE = 0.6
 """Of its letters that a slip must have in common with a name."""
+
+WRAPPERS = {"physjax", "jaxtyping", "beartype"}
+"""Packages whose frames are between who asks for a name and the error of it."""
 
 SYNONYMS: dict[str, tuple[str, ...]] = {
     # shapes and what is touched
@@ -158,18 +163,23 @@ class Hint(NamedTuple):
 
 
 def suggest_names(name: str, names: Iterable[str]) -> str:
-    """A sentence with those of `names` that were meant by another: by its meaning, then by its letters; else all, if few."""
-    public = sorted(name for name in names if not name.startswith("_"))
-    bare = {other: _strip(other) for other in public}
+    """A sentence with those of `names` that were meant by another: by its meaning, then by its letters; else all, if few.
+
+    A name may be dotted, `forces.Gravity`: its last part counts.
+    """
+    public = sorted((name for name in names if not name.startswith("_")), key=lambda name: (name.count("."), name))
+    bare = {other: _strip(_take_last_part(other)) for other in public}
     asked = _strip(name)
     near = [other for other in public if bare[other].removesuffix("s") == asked.removesuffix("s")]
-    near += [meant for word in (asked, asked.removesuffix("s")) for meant in SYNONYMS.get(word, ()) if meant in bare]
+    for meant in (meant for word in (asked, asked.removesuffix("s")) for meant in SYNONYMS.get(word, ())):
+        near += [other for other in public if _take_last_part(other) == meant]
+    # the same name in another place, else a name of this place, else one of another place that means the same
+    near = [o for o in near if _take_last_part(o) == name] or [o for o in near if "." not in o] or near
     if not near:
         close = get_close_matches(asked, bare.values(), n=MAX_HINTS, cutoff=CLOSE_SHARE)
         near = [other for word in close for other in public if bare[other] == word]
-    near.sort(
-        key=lambda other: other[0].isupper() != name[0].isupper()
-    )  # a class for a class, a function for a function
+    # a class for a class, a function for a function
+    near.sort(key=lambda other: _take_last_part(other)[0].isupper() != name[0].isupper())
     if near:
         hint = f"Did you mean {' or '.join(list(dict.fromkeys(near))[:MAX_HINTS])}?"
         return f"{hint} {NOTES[asked]}" if asked in NOTES else hint
@@ -185,6 +195,28 @@ def refuse_name(owner: str, name: str, find_names: Callable[[], Iterable[str]]) 
     return AttributeError(Hint(sentence, name, find_names), name=name, obj=None)
 
 
+def refuse_module_name(module: str, name: str, find_names: Callable[[], Iterable[str]]) -> AttributeError | ImportError:
+    """The error of a name that a module does not have, for the module's `__getattr__`.
+
+    `from module import name` puts a sentence of its own in place of an AttributeError, but lets an ImportError pass.
+    """
+    if name.startswith("_") or not _is_import_from(_find_asker()):
+        return refuse_name(f"module {module!r}", name, find_names)
+    return ImportError(Hint(f"cannot import name {name!r} from {module!r}", name, find_names), name=module)
+
+
+def _find_asker() -> FrameType | None:
+    """The frame of who asked this package for a name, above those of checkers of types that wrap it."""
+    frame = sys._getframe(1)
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in WRAPPERS:
+        frame = frame.f_back
+    return frame
+
+
+def _is_import_from(frame: FrameType | None) -> bool:
+    return frame is not None and opname[frame.f_code.co_code[frame.f_lasti]] == "IMPORT_FROM"
+
+
 def hint_at_names(module: str) -> None:
     """Let a module that is asked for what it does not have say what it has.
 
@@ -192,13 +224,17 @@ def hint_at_names(module: str) -> None:
     """
 
     def refuse(name: str) -> NoReturn:
-        raise refuse_name(f"module {module!r}", name, sys.modules[module].__dir__)
+        raise refuse_module_name(module, name, sys.modules[module].__dir__)
 
     sys.modules[module].__getattr__ = refuse
+
+
+def _take_last_part(name: str) -> str:
+    return name.rpartition(".")[2]
 
 
 def _strip(name: str) -> str:
     return name.replace("_", "").lower()
 
 
-__all__ = ["SYNONYMS", "Hint", "hint_at_names", "refuse_name", "suggest_names"]
+__all__ = ["SYNONYMS", "Hint", "hint_at_names", "refuse_module_name", "refuse_name", "suggest_names"]

@@ -22,6 +22,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from physjax.checks import as_real_array, as_real_quantity, concrete_or_none
+from physjax.name_hints import hint_at_names
 from physjax.vectors import norm, square_root
 
 __all__ = [
@@ -314,3 +315,6 @@ def _nan_unless(ok: Array, value: Array) -> Array:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -75,6 +75,37 @@ def test_a_wrong_name_is_answered_by_the_right_one(place, name, words):
     assert shown.count("Did you mean") <= 1, "Python adds no guess of its own"
 
 
+@pytest.mark.parametrize(
+    ("statement", "words"),
+    [
+        ("from physjax import rk4", "cannot import name 'rk4' from 'physjax'. Did you mean methods.rk4?"),
+        ("from physjax import Gravity", "Did you mean forces.Gravity?"),
+        ("from physjax import Drag", "Did you mean forces.QuadraticDrag or forces.SphereDrag or forces.StokesDrag?"),
+        ("from physjax import simulat", "Did you mean simulate"),
+        (
+            "from physjax.physics import forcs",
+            "cannot import name 'forcs' from 'physjax.physics'. Did you mean forces?",
+        ),
+        ("from physjax.stepping.methods import rk_4", "from 'physjax.stepping.methods'. Did you mean rk4?"),
+        ("from physjax.scenes import SCENE", "Did you mean SCENES or scene"),
+    ],
+)
+def test_a_wrong_import_is_answered_by_the_right_name(statement, words):
+    with pytest.raises(ImportError) as caught:
+        exec(statement, {})
+    assert words in str(caught.value)
+    with pytest.raises(ImportError, match=r"^cannot import name '_rk4' from 'physjax' \("):
+        exec("from physjax import _rk4", {})
+
+
+def test_a_name_of_a_namespace_is_found_where_it_is():
+    assert not hasattr(physjax, "rk4")
+    with pytest.raises(
+        AttributeError, match=r"module 'physjax' has no attribute 'gravity'\. Did you mean forces\.Gravity\?"
+    ):
+        _ = physjax.gravity
+
+
 def test_names_that_python_asks_for_are_refused_as_ever():
     with pytest.raises(AttributeError, match=r"^module 'physjax\.physics\.forces' has no attribute '__wrapped__'$"):
         _ = forces.__wrapped__

@@ -19,6 +19,7 @@ Example:
 from importlib import import_module
 from pkgutil import iter_modules
 
+from physjax.name_hints import hint_at_names
 from physjax.scenes.registry import FAILURES, SCENES, failure, scene, title
 
 for _module in iter_modules(__path__):
@@ -29,3 +30,6 @@ __all__ = ["FAILURES", "SCENES", "failure", "scene", "title"]
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

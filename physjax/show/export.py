@@ -17,6 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from physjax.files import write_atomically, write_folder_atomically
+from physjax.name_hints import hint_at_names
 from physjax.show.bodies import choose_body_colours
 from physjax.show.drawables import Bodies, Dots, Look, PlanarFigures, Surface, choose_drawable
 from physjax.show.films import schedule
@@ -273,3 +274,6 @@ def _track_progress(items: Iterable[T], progress: bool) -> Iterable[T]:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from physjax.checks import Numbers, OptionalNumbers, as_positive_integer, quantity, unchecked_quantity
+from physjax.name_hints import hint_at_names
 from physjax.particles import Particles
 from physjax.parts import Field, Force
 from physjax.vectors import broadcast_vector, components, cross, dot, norm, scale, stack_components, turn_left, unit
@@ -173,3 +174,6 @@ __all__ = ["Attractor", "Flow", "Turbulence", "Vortex"]
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -4,6 +4,7 @@ Everything is computed in float64 unless another dtype is asked for, errors are 
 far the reference moves, and a run that fails is kept and marked, never dropped.
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.study.ablation.ablate import ablate
 from physjax.study.accuracy.error_measures import energy, final, momentum, outcome, path, penetration
 from physjax.study.accuracy.options import QUICK, THOROUGH, TOLERANCES, Budget, Options, SearchOptions
@@ -36,3 +37,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

@@ -1,5 +1,6 @@
 """Energy, momentum and angular momentum of a scene: what its physics conserves, and so what a method should."""
 
+from physjax.name_hints import hint_at_names
 from physjax.study.energy.quantities import (
     ANGULAR_MOMENTUM,
     ENERGY,
@@ -31,3 +32,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)

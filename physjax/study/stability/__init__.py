@@ -4,6 +4,7 @@
 a method alone. `map` judges runs over methods and steps, `explain` says why one went wrong.
 """
 
+from physjax.name_hints import hint_at_names
 from physjax.study.stability.explain import Explanation, explain
 from physjax.study.stability.limits import Limit, Region, grows_by_itself, growth, limit, region
 from physjax.study.stability.map import StabilityMap, map
@@ -28,3 +29,6 @@ __all__ = [
 
 def __dir__() -> list[str]:
     return __all__
+
+
+hint_at_names(__name__)
