@@ -1,5 +1,7 @@
 """Ropes and cloth that hang, fly in the wind, and drape over a ball."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,10 +74,13 @@ def elastic_catenary(along: np.ndarray, span: float, weight: float, stiffness: f
         sag = sag + pull * length / weight * (np.hypot(1, rise[0] / pull) - np.hypot(1, rise / pull))
         return np.stack([x - span / 2, -sag], axis=-1)
 
+    def reach(pull):
+        return pull * length / stiffness + 2 * pull * length / weight * math.asinh(weight / 2 / pull)
+
     low, high = 1e-6 * weight, 1e6 * weight
     for _ in range(200):  # bisection of log H: the span grows with the pull
-        pull = np.sqrt(low * high)
-        low, high = (pull, high) if points(pull)[-1, 0] < span / 2 else (low, pull)
+        pull = math.sqrt(low * high)
+        low, high = (pull, high) if reach(pull) < span else (low, pull)
     return points(pull)
 
 

@@ -170,8 +170,10 @@ class Film:
         figure, show = self._build_renderer()
         middle = _render_picture(figure, show, self.frames[len(self.frames) // 2])
         width, height = middle.size
-        # lines and points are small in lossless compression, and suffer from loss; shaded surfaces are the opposite
-        if len(_encode_webp(middle.quantize(), lossless=True)) <= LOSSLESS_LIMIT_BYTES:
+        # lines and points are small in lossless compression, and suffer from loss; shaded surfaces are the opposite,
+        # and would be lit from behind if a dark page mirrored their colours
+        kind = "lines" if len(_encode_webp(middle.quantize(), lossless=True)) <= LOSSLESS_LIMIT_BYTES else "shaded"
+        if kind == "lines":
             codes = (_encode_webp(picture, lossless=True) for picture in self._render_pictures(progress))
         else:
             drawn = (_render_picture(figure, show, frame) for frame in _track_progress(self.frames, progress))
@@ -180,10 +182,8 @@ class Film:
         time = self.scenery.run.time[list(self.frames)]
         paced = time[:-1] if len(time) > 2 else time  # the end is shown when it is due, or a little early
         speed = float(f"{np.polyfit(np.arange(len(paced)), paced, 1)[0] * self.fps:.2g}")
-        page = fill_page(
-            "film.html", WIDTH=width, HEIGHT=height, FPS=self.fps, SPEED=speed, PICTURES=json.dumps(pictures)
-        )
-        return page, height
+        parts = {"WIDTH": width, "HEIGHT": height, "FPS": self.fps, "SPEED": speed, "KIND": kind}
+        return fill_page("film.html", **parts, PICTURES=json.dumps(pictures)), height
 
 
 def schedule(who: str, run: Frames, fps: int | float, speed: float) -> tuple[list[int], float]:

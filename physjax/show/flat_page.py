@@ -1,12 +1,17 @@
 """What the page of `animate.view` is made from where a run is in the plane: bodies as outlines, and surfaces as lines."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from physjax.parts import Contact
+from physjax.physics.contacts.surface import Surface
 from physjax.physics.rigid.planar import PlanarShape
 from physjax.show import level_sets
 from physjax.show.frames import Frames
@@ -29,6 +34,8 @@ STRAIGHT_SHARE = 1e-4
 """A point of an edge that is off the line between its neighbours by less than this share of the box is left out."""
 MAX_OBSTACLE_STATES = 240
 """A surface that moves is sent at most this many times; in between it stays."""
+MAX_REST_RATIO = 4.0
+"""A driven surface is found once, at rest, unless this many times the window would have to be searched for it."""
 
 
 def take_flat_bodies(
@@ -75,24 +82,60 @@ def describe_flat_obstacle(contact: Contact, scenery: Scenery, frames: list[int]
     wide = Stage(middle - reach, middle + reach)
     count = min(len(frames), MAX_OBSTACLE_STATES) if level_sets.moves(contact, wide, times) else 1
     chosen = np.linspace(0, len(frames), count, endpoint=False).astype(int)
-    return {"states": [{"frame": int(i)} | _trace_contours(contact, wide, float(times[i]), points) for i in chosen]}
+    states = _drive_contours(contact, wide, times[chosen], points) if count > 1 else None
+    states = states or [_trace_contours(contact, wide, float(times[i]), points) for i in chosen]
+    return {"states": [{"frame": int(i)} | state for i, state in zip(chosen, states, strict=True)]}
 
 
-def _trace_contours(contact: Contact, stage: Stage, t: float, points: int) -> Json:
+def _drive_contours(contact: Contact, stage: Stage, times: np.ndarray, points: int) -> list[Json] | None:
+    """The contours of a surface that moves as a rigid body, found once and placed; None for any other."""
+    if not isinstance(contact, Surface) or (contact.motion is None and contact.velocity is None):
+        return None
+    rest = eqx.tree_at(lambda s: (s.motion, s.velocity), contact, (None, None), is_leaf=lambda leaf: leaf is None)
+    with jax.enable_x64(True):
+        axes = np.asarray(_find_rest_axes(contact, jnp.asarray(times, float)))
+    origins, turns = axes[:, 0], axes[:, 1:] - axes[:, :1]  # at rest is o + x T what is at x, and T is a rotation
+    corners = np.stack(np.meshgrid(*zip(*stage, strict=True)), axis=-1).reshape(-1, 2)
+    seen = (origins[:, None] + corners @ turns).reshape(-1, 2)
+    middle, half = (seen.min(axis=0) + seen.max(axis=0)) / 2, float(np.ptp(seen, axis=0).max()) / 2
+    ratio = 2 * half / stage.size
+    if not ratio <= MAX_REST_RATIO or level_sets.moves(rest, stage, times):
+        return None
+    found = _trace_contours(rest, Stage(middle - half, middle + half), float(times[0]), int(np.ceil(ratio * points)))
+    decimals = _count_decimals(stage)
+    return [
+        {
+            kind: [np.round((line - origin) @ turn.T, decimals).tolist() for line in lines]
+            for kind, lines in found.items()
+        }
+        for origin, turn in zip(origins, turns, strict=True)
+    ]
+
+
+@eqx.filter_jit
+def _find_rest_axes(surface: Surface, times: Float[Array, " times"]) -> Float[Array, "times 3 2"]:
+    """Where the origin and the ends of both unit vectors are, seen from the surface."""
+    axes = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], times.dtype)
+    return jax.vmap(lambda t: surface.rest_place(t, axes))(times)
+
+
+def _trace_contours(contact: Contact, stage: Stage, t: float, points: int) -> dict[str, list[list[list[float]]]]:
     """The polygons of the wrong side of a contact in a box, and the lines of its edge."""
-    from matplotlib.figure import Figure
+    from contourpy import FillType, LineType, contour_generator
 
     x, y = (np.linspace(low, high, points) for low, high in zip(*stage, strict=True))
     distance = level_sets.evaluate_distance(contact, t, np.stack(np.meshgrid(x, y), axis=-1))
     if not distance.min() < 0:
         return {"areas": [], "edges": []}
-    ax = Figure().add_subplot()
-    areas = ax.contourf(x, y, distance, levels=[-np.inf, 0], colors=["0"]).get_paths()
-    edges = ax.contour(x, y, distance, levels=[0]).get_paths() if distance.max() > 0 else []
-    trace = lambda paths, closed: [  # noqa: E731
-        _straighten(np.asarray(points), stage) for path in paths for points in path.to_polygons(closed_only=closed)
-    ]
-    return {"areas": trace(areas, True), "edges": trace(edges, False)}
+    distance = np.minimum(distance, 4 * stage.size)  # where it is no number it is infinite
+    found = contour_generator(x, y, distance, fill_type=FillType.OuterOffset, line_type=LineType.Separate)
+    # neither is None without chunks, as its types allow
+    polygons, offsets = cast(
+        "tuple[list[np.ndarray], list[np.ndarray]]", found.filled(distance.min() - stage.size, 0.0)
+    )
+    rings = [ring for points, ends in zip(polygons, offsets, strict=True) for ring in np.split(points, ends[1:-1])]
+    edges = cast("list[np.ndarray]", found.lines(0.0)) if distance.max() > 0 else []
+    return {"areas": [_straighten(ring, stage) for ring in rings], "edges": [_straighten(e, stage) for e in edges]}
 
 
 def _straighten(points: np.ndarray, stage: Stage) -> list[list[float]]:
@@ -113,5 +156,9 @@ def _straighten(points: np.ndarray, stage: Stage) -> list[list[float]]:
         if far[worst] > STRAIGHT_SHARE * stage.size:
             kept[start + 1 + worst] = True
             legs += [(start, start + 1 + worst), (start + 1 + worst, end)]
-    decimals = int(6 - np.floor(np.log10(stage.size)))
-    return np.round(points[kept], decimals).tolist()
+    return np.round(points[kept], _count_decimals(stage)).tolist()
+
+
+def _count_decimals(stage: Stage) -> int:
+    """Of a number of metres in a box: a millionth of it."""
+    return int(6 - np.floor(np.log10(stage.size)))

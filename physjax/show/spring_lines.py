@@ -94,18 +94,21 @@ def build_spring_lines(who: str, lines: Lines, frames: Sequence[int], limit: int
     if limit is None and lines.rest is None:
         return spring_lines
     if limit is None:
-        most = [_strain_percentile(spring_lines, lines.run.position[frame].astype(float), frame) for frame in frames]
-        limit = min(max(most), MAX_BLOWN_UP_STRAIN if lines.run.blew_up else np.inf) or MIN_STRAIN_LIMIT
+        most = _measure_most_strain(spring_lines, lines.run.position[list(frames)].astype(float), list(frames))
+        limit = min(most, MAX_BLOWN_UP_STRAIN if lines.run.blew_up else np.inf) or MIN_STRAIN_LIMIT
     elif not limit > 0:
         raise ValueError(f"{who}: got limit={limit}, expected a strain > 0, e.g. 0.05 for five per cent.")
     return spring_lines._replace(limit=float(limit))
 
 
-def _strain_percentile(spring_lines: SpringLines, position: np.ndarray, frame: int) -> float:
-    """The strain that nearly all springs stay below in a frame, stretched or compressed."""
-    strain = np.abs(spring_lines.strain(position))
-    shown = np.isfinite(strain) & (True if spring_lines.held is None else spring_lines.held[frame])
-    return float(np.percentile(strain[shown], STRAIN_PERCENTILE)) if shown.any() else 0.0
+def _measure_most_strain(spring_lines: SpringLines, positions: np.ndarray, frames: list[int]) -> float:
+    """The most, over frames, of the strain that nearly all springs stay below in each, stretched or compressed."""
+    strain = np.abs(spring_lines.strain(positions))
+    hidden = ~np.isfinite(strain) if spring_lines.held is None else ~(np.isfinite(strain) & spring_lines.held[frames])
+    if not hidden.any():
+        return float(np.percentile(strain, STRAIN_PERCENTILE, axis=1).max())
+    seen = [row[~gone] for row, gone in zip(strain, hidden, strict=True) if not gone.all()]
+    return max((float(np.percentile(row, STRAIN_PERCENTILE)) for row in seen), default=0.0)
 
 
 def draw_springs(ax: "Axes", scenery: Scenery, frame: int, *, spring_lines: SpringLines) -> "list[Artist]":

@@ -7,12 +7,15 @@ import re
 import shutil
 import subprocess
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from physjax import Particles, Scene, animate, methods, simulate
+from physjax.show import films
 from physjax.show.dark import DARK_INK, DARK_PAGE, turn_dark
 from physjax.show.pages import read_web_file
 from physjax.show.style import PALETTE
@@ -107,6 +110,35 @@ def test_a_page_has_each_picture_in_both_themes():
     style = re.search(r"<style>(.*?)</style>", page, re.S)[1]
     own = style.replace(read_web_file("colors.css"), "")
     assert not re.search(r"#[0-9a-fA-F]{3}\b|#[0-9a-fA-F]{6}\b", own), "every colour is one of the themes"
+
+
+def test_a_film_mirrors_lines_and_leaves_shaded_surfaces_as_they_are(monkeypatch):
+    ball = Particles(jnp.zeros(2), jnp.array([3.0, 4.0]))
+    film = animate.paths(simulate(Scene(ball), methods.euler, dt=0.05, steps=2))
+    for kind, limit in (("lines", 10**6), ("shaded", 0)):
+        monkeypatch.setattr(films, "LOSSLESS_LIMIT_BYTES", limit)
+        page, _ = film._build_player(progress=False)
+        assert f'id="picture" class="{kind}"' in page
+        assert ".lines { filter: var(--mirror); }" in page
+        assert "background: var(--page)" in page
+        assert "prefers-color-scheme: dark" in page
+    light, *dark = re.findall(r"--mirror: (.*?);", read_web_file("colors.css"))
+    (share,) = {float(re.match(r"invert\((.*)\) hue-rotate\(180deg\)$", mirror)[1]) for mirror in dark}
+    assert light == "none"
+    np.testing.assert_allclose([1 - share] * 3, DARK_PAGE, atol=0.02)  # what white becomes, and black
+    np.testing.assert_allclose([share] * 3, DARK_INK, atol=0.02)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
+def test_a_page_in_a_notebook_has_the_theme_of_the_notebook():
+    program = re.search(r"function findNotebookTheme.*?^}$", read_web_file("tools.html"), re.S | re.M)[0]
+    lab = '{ document: { body: { dataset: { jpThemeLight: "%s" } } } }'
+    code = '{ document: { body: { dataset: {}, classList: { contains: name => name === "%s" } } } }'
+    parents = [lab % "true", lab % "false", code % "vscode-dark", code % "vscode-light", code % "", "{}"]
+    each = f"[{', '.join(parents)}].map(page => {{ parent = page; return findNotebookTheme(); }})"
+    asked = f"let parent; {program} console.log(JSON.stringify({each}))"
+    output = subprocess.run(["node", "-e", asked], capture_output=True, text=True, check=True)
+    assert json.loads(output.stdout) == ["light", "dark", "dark", "light", None, None]
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")

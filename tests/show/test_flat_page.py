@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, animate, contacts, inertia, methods, rigid, simulate
+from physjax.show import flat_page
 from physjax.show.flat_page import CONTOUR_POINTS, HALF_TURN_STEPS, ROOM_SHARE
+from physjax.show.frames import take_lanes
+from physjax.show.panels import build_scenery
 
 SHAPES = (rigid.PlanarShape.box((2.0, 1.0)), rigid.PlanarShape.disc(0.5), rigid.PlanarShape.disc(0.5))
 DISC = inertia.planar_disc(1.0, 0.5)
@@ -77,6 +80,36 @@ def test_surfaces_that_move_are_sent_as_they_are_at_each_frame_and_round_ones_ar
     radius = np.hypot(*(np.array(round_one[0]["edges"][0]) - [2.0, 0.0]).T)
     assert len(radius) < CONTOUR_POINTS / 3
     np.testing.assert_allclose(radius, 0.5, rtol=5e-3)
+
+
+def drive(t):
+    return 3.0 * t
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [{"motion": contacts.Motion(angle=drive, pivot=(0.3, 0.2))}, {"velocity": (0.5, 0.2)}],
+    ids=["turns", "slides"],
+)
+def test_a_driven_surface_is_found_once_and_placed_where_it_would_be_found(moved, monkeypatch):
+    room = contacts.Room((-1.0, -1.0), (1.0, 2.0), **moved)
+    still = Particles(jnp.array([[-0.5, 0.0], [0.5, 0.5]]), jnp.zeros((2, 2)))
+    run = simulate(Scene(still), methods.verlet, dt=0.1, steps=2)
+    run = dataclasses.replace(run, scene=Scene(still, contacts=(room,)))  # which it does not touch
+    scenery, calls, trace = build_scenery(take_lanes("test", run, (2,)), [0, 1, 2]), [], flat_page._trace_contours
+    monkeypatch.setattr(flat_page, "_trace_contours", lambda *args: calls.append(args) or trace(*args))
+    placed = flat_page.describe_flat_obstacle(room, scenery, [0, 1, 2], points=61)["states"]
+    assert len(calls) == 1
+    monkeypatch.setattr(flat_page, "_drive_contours", lambda *args: None)
+    found = flat_page.describe_flat_obstacle(room, scenery, [0, 1, 2], points=61)["states"]
+    assert len(calls) == 4
+    for number, (one, other) in enumerate(zip(placed, found, strict=True)):
+        assert one["frame"] == other["frame"] == number
+        assert len(one["areas"]) == len(other["areas"]) > 0
+        for state in (one, other):
+            edge = np.concatenate([np.array(line) for line in state["edges"]])
+            distance = room.signed_distance(jnp.asarray(0.1 * number), jnp.asarray(edge))
+            assert float(jnp.abs(distance).max()) < 0.05  # corners are cut off by a cell
 
 
 def test_springs_and_bodies_without_a_shape_are_seen_as_well(ruin):
