@@ -37,6 +37,8 @@ START_STEPS, STEP_RANGE = 500, (40.0, 25.0)
 """Steps of the first run where no dt is named, and by how much they may be longer or shorter."""
 SHORTENING, MAX_SHORTENINGS = 4.0, 6
 """A first step with which the run does not stay finite is shortened by this factor, at most so many times."""
+SLOW_RUN_SECONDS, GAME_STEP_SECONDS = 0.06, 1 / 60
+"""A first run that takes longer than the first [s] has steps of the second, or one for each frame: pictures follow the slider."""
 MAX_KEPT_LIMITS = 512
 """Stable steps of so many settings are kept."""
 
@@ -106,8 +108,13 @@ class Engine:
         return Settings(clipped, method, self.step_slider.clip(asked.get("dt", self.start.dt)))
 
     def find_start(self) -> Answer:
-        """The first answer; where dt was left open, with a step that keeps the run finite."""
+        """The first answer; where dt was left open, with a step that keeps the run finite, and is long in slow scenes."""
         answer = self.answer(self.start)
+        is_slow = answer.run.step_seconds * answer.run.steps > SLOW_RUN_SECONDS
+        dt = min(GAME_STEP_SECONDS, answer.built.duration / self.frames)
+        if self._searches_start and is_slow and dt > answer.run.dt:
+            longer = self.answer(answer.settings._replace(dt=dt))
+            answer = answer if longer.run.failed.any() else longer
         for _ in range(MAX_SHORTENINGS if self._searches_start else 0):
             shorter = answer.settings.dt / SHORTENING
             if not answer.run.failed.any() or shorter < self.step_slider.low:

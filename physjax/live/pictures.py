@@ -79,7 +79,8 @@ def snap(stage: Stage) -> Stage:
 def _stand_side_by_side(run: Frames) -> Frames:
     """Particles on a line as particles in the plane, each in a column of its own."""
     position = run.position.astype(float)
-    height = float(np.nanmax(position) - np.nanmin(position)) or 1.0
+    good = position[: run.good_frames]  # what blows up may be infinite at last
+    height = float(np.nanmax(good) - np.nanmin(good)) or 1.0
     lanes = position.shape[1]
     columns = (np.arange(lanes) - (lanes - 1) / 2) * LINE_ASPECT * height / max(lanes, 2)
     across = np.where(np.isfinite(position), columns[:, None], np.nan)

@@ -17,6 +17,8 @@ ROUGH_ERROR, LARGE_ERROR = 1e-3, 3e-2
 """Shares of the path beyond which an error may be seen, and is seen."""
 CLOSE_TO_LIMIT = 0.8
 """A step longer than this share of the longest stable one is marked."""
+SHORT_PATH_SHARE = 0.01
+"""A path shorter than this share of the room that the scene takes is no measure of its error: a stack rests."""
 ROUNDING_DRIFT = 1e-12
 """A change of energy below this share of the kinetic energy is rounding."""
 
@@ -34,12 +36,24 @@ def describe_error(run: Run, truth: object, against: str) -> Figure:
     """How far the run is from the true states at its moments, or from what is taken for them."""
     scene = run.flight.scene
     assert scene is not None
-    moments = path.moments(scene, np.asarray(run.flight.time), run.flight.state, truth)
-    share = float(moments.max()) if np.isfinite(moments).all() else np.inf
+    times, floor = np.asarray(run.flight.time), _find_floor(run)
+    reach = np.broadcast_to(path.size(scene, times, truth), scene.status_shape or (1,)).ravel()
+    units = path.units(scene, times, run.flight.state, truth, np.maximum(path.size(scene, times, truth), floor))
+    share = float(units.max()) if np.isfinite(units).all() else np.inf
     if not np.isfinite(share):
         return Figure("error", "not finite", against, "bad")
     grade = "good" if share < ROUGH_ERROR else "fair" if share < LARGE_ERROR else "bad"
-    return Figure("error", format_share(share), f"of the path, {against}", grade)
+    short = reach[int(units.max(axis=0).argmax())] < floor
+    whole = f"{floor:.2g} m, since little moves" if short else "the path"
+    return Figure("error", format_share(share), f"of {whole}, {against}", grade)
+
+
+def _find_floor(run: Run) -> float:
+    """The shortest path that errors are relative to [m]."""
+    place = np.asarray(run.flight.position, float)
+    with np.errstate(invalid="ignore"):
+        room = np.ptp(place.reshape(-1, place.shape[-1]), axis=0).max()
+    return SHORT_PATH_SHARE * float(room) if np.isfinite(room) else 0.0
 
 
 def describe_energy(run: Run, built: Built, source: Source) -> Figure:
@@ -56,6 +70,9 @@ def describe_energy(run: Run, built: Built, source: Source) -> Figure:
         return Figure(name, "not finite", "of the kinetic energy", "bad")
     worst = float(shares.flat[np.argmax(np.abs(shares))])
     text = "none" if abs(worst) < ROUNDING_DRIFT else ("+" if worst > 0 else "−") + format_share(abs(worst))
+    if name == "energy change" and abs(worst) > 1:  # a stack that rests has none to speak of
+        most = float(change.flat[np.argmax(np.abs(change))])
+        return Figure(name, f"{most:+.2g} J".replace("-", "−"), "more than all kinetic energy; contacts do work here")
     if name == "energy change":
         return Figure(name, text, "of the kinetic energy; forces and contacts do work here")
     grade = "good" if abs(worst) < ROUGH_ERROR else "fair" if abs(worst) < LARGE_ERROR else "bad"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from physjax import Particles, Scene, explore, forces, methods, simulate
+from physjax.live import engine as engine_module
 from physjax.live.engine import Engine
 from physjax.live.pictures import snap
 from physjax.live.runs import Overtaken
@@ -136,6 +137,31 @@ def test_the_strip_names_the_stable_step_its_cause_and_what_failed():
     assert found["energy change"].value == found["error"].value == "not finite"
     sound = engine.answer(engine.read_settings(numbers(stiffness=4.0) | {"dt": 0.5}))
     assert figures(engine, sound)["status"].value == "ok"
+
+
+def sway(amplitude):
+    """Two weights ten metres apart, one of which hardly moves."""
+    places, pull = jnp.array([[0.0], [10.0]]), forces.Anchor(jnp.array([[0.0], [10.0]]), 4.0)
+    return Scene(Particles(places + amplitude * jnp.array([[1.0], [1e-9]]), jnp.zeros((2, 1))), forces=(pull,))
+
+
+def test_the_error_of_what_rests_is_no_share_of_its_path():
+    engine = Engine(sway, {"amplitude": (1e-3, 2.0, 1e-3)}, methods=[methods.euler], duration=2.0, dt=(0.01, 0.1))
+    small, large = (figures(engine, engine.answer(engine.read_settings(numbers(amplitude=a)))) for a in (1e-3, 2.0))
+    assert small["error"].note == "of 0.1 m, since little moves, against half the step"
+    assert small["error"].value != large["error"].value
+    assert large["error"].note == "of the path, against half the step"
+
+
+def test_slow_scenes_start_with_steps_of_a_game_and_one_for_each_frame(monkeypatch):
+    monkeypatch.setattr(engine_module, "SLOW_RUN_SECONDS", 0.0)
+    for duration, dt in ((4.0, 1 / 60), (0.4, 0.4 / 96)):
+        engine = Engine(swing, {"stiffness": (1.0, 9.0)}, methods=[methods.verlet], duration=duration)
+        assert engine.find_start().settings.dt == engine.start.dt == pytest.approx(dt)
+    engine = Engine(swing, {"stiffness": (1.0, 9.0)}, methods=[methods.verlet], duration=4.0, dt=1e-3)
+    assert engine.find_start().settings.dt == 1e-3, "a step that was asked for stays"
+    engine = Engine(swing, {"stiffness": (1e4, 9e5)}, methods=[methods.verlet], duration=4.0)
+    assert engine.find_start().settings.dt < 1 / 60, "the longer one blows up"
 
 
 def test_a_gallery_scene_has_its_closed_form_its_units_and_runs_from_its_own_code():

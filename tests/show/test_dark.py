@@ -134,11 +134,12 @@ def test_a_page_in_a_notebook_has_the_theme_of_the_notebook():
     program = re.search(r"function findNotebookTheme.*?^}$", read_web_file("tools.html"), re.S | re.M)[0]
     lab = '{ document: { body: { dataset: { jpThemeLight: "%s" } } } }'
     code = '{ document: { body: { dataset: {}, classList: { contains: name => name === "%s" } } } }'
-    parents = [lab % "true", lab % "false", code % "vscode-dark", code % "vscode-light", code % "", "{}"]
+    marimo = '{ document: { body: { dataset: { theme: "dark" }, classList: { contains: name => false } } } }'
+    parents = [marimo, lab % "true", lab % "false", code % "vscode-dark", code % "vscode-light", code % "", "{}"]
     each = f"[{', '.join(parents)}].map(page => {{ parent = page; return findNotebookTheme(); }})"
     asked = f"let parent; {program} console.log(JSON.stringify({each}))"
     output = subprocess.run(["node", "-e", asked], capture_output=True, text=True, check=True)
-    assert json.loads(output.stdout) == ["light", "dark", "dark", "light", None, None]
+    assert json.loads(output.stdout) == ["dark", "light", "dark", "dark", "light", None, None]
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")

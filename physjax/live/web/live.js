@@ -181,7 +181,7 @@ function findTheme() {
   if (body.dataset.jpThemeLight) return body.dataset.jpThemeLight === "true" ? "light" : "dark";
   if (body.classList.contains("vscode-dark") || body.classList.contains("vscode-high-contrast")) return "dark";
   if (body.classList.contains("vscode-light")) return "light";
-  return null;
+  return ["light", "dark"].includes(body.dataset.theme) ? body.dataset.theme : null;  // marimo's
 }
 
 /** The engine behind a web server on this machine: every request is answered by a stream of messages. */
