@@ -37,12 +37,13 @@ def describe_error(run: Run, truth: object, against: str) -> Figure:
     scene = run.flight.scene
     assert scene is not None
     times, floor = np.asarray(run.flight.time), _find_floor(run)
-    reach = np.broadcast_to(path.size(scene, times, truth), scene.status_shape or (1,)).ravel()
-    units = path.units(scene, times, run.flight.state, truth, np.maximum(path.size(scene, times, truth), floor))
+    size = path.size(scene, times, truth)
+    units = path.units(scene, times, run.flight.state, truth, np.maximum(size, floor))
     share = float(units.max()) if np.isfinite(units).all() else np.inf
     if not np.isfinite(share):
         return Figure("error", "not finite", against, "bad")
     grade = "good" if share < ROUGH_ERROR else "fair" if share < LARGE_ERROR else "bad"
+    reach = np.broadcast_to(size, run.flight.position.shape[1:-1]).ravel()  # nodes of a coupled scene share theirs
     short = reach[int(units.max(axis=0).argmax())] < floor
     whole = f"{floor:.2g} m, since little moves" if short else "the path"
     return Figure("error", format_share(share), f"of {whole}, {against}", grade)

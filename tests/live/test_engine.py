@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physjax import Particles, Scene, explore, forces, methods, simulate
+from physjax import Particles, Scene, explore, forces, methods, simulate, springs
 from physjax.live import engine as engine_module
 from physjax.live.engine import Engine
 from physjax.live.pictures import snap
@@ -139,6 +139,12 @@ def test_the_strip_names_the_stable_step_its_cause_and_what_failed():
     assert figures(engine, sound)["status"].value == "ok"
 
 
+def stretch(length):
+    """Two weights on a spring."""
+    pull = springs.Springs([(0, 1)], stiffness=4.0, rest_length=1.0)
+    return Scene(Particles(length * jnp.array([[0.0], [1.0]]), jnp.zeros((2, 1))), forces=(pull,))
+
+
 def sway(amplitude):
     """Two weights ten metres apart, one of which hardly moves."""
     places, pull = jnp.array([[0.0], [10.0]]), forces.Anchor(jnp.array([[0.0], [10.0]]), 4.0)
@@ -151,6 +157,12 @@ def test_the_error_of_what_rests_is_no_share_of_its_path():
     assert small["error"].note == "of 0.1 m, since little moves, against half the step"
     assert small["error"].value != large["error"].value
     assert large["error"].note == "of the path, against half the step"
+
+
+def test_nodes_of_a_coupled_scene_share_their_path():
+    engine = Engine(stretch, {"length": (1.0, 2.0)}, methods=[methods.euler], duration=2.0, dt=(0.01, 0.1))
+    note = figures(engine, engine.find_start())["error"].note
+    assert note == "of the path, against half the step"
 
 
 def test_slow_scenes_start_with_steps_of_a_game_and_one_for_each_frame(monkeypatch):
