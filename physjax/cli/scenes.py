@@ -23,8 +23,7 @@ def _run_scenes(detailed: list[str], only: list[str], out: str | None) -> int:
     """Print every scene, and every run that must fail; or draw the scenes. Returns 1 if one could not be drawn."""
     from physjax.checks import demand_known
     from physjax.scenes import FAILURES, SCENES, title
-    from physjax.scenes.catalogue import list_scene
-    from physjax.text import format_table
+    from physjax.scenes.catalogue import list_scene, wrap_line
 
     names = list(dict.fromkeys([*detailed, *only]))
     chosen = [demand_known("scene", name, SCENES) for name in names] or list(SCENES)
@@ -35,7 +34,9 @@ def _run_scenes(detailed: list[str], only: list[str], out: str | None) -> int:
         if name in detailed:
             print(_format_numbers(name), end="\n\n")
     if not names:
-        print(format_table(["failure", "what it is"], [[name, title(name)] for name in FAILURES], align="<<"))
+        print("Runs that must fail:", end="\n\n")
+        for name in FAILURES:
+            print(f"{name}\n{wrap_line(title(name), 4)}", end="\n\n")
     return 0
 
 

@@ -40,10 +40,12 @@ class Entry(NamedTuple):
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.size}", self.title, f"truth: {self.truth}"]
-        return "\n".join(
-            fill(line, LINE_WIDTH, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
-            for line, indent in zip(lines, (0, 4, 4), strict=True)
-        )
+        return "\n".join(wrap_line(line, indent) for line, indent in zip(lines, (0, 4, 4), strict=True))
+
+
+def wrap_line(line: str, indent: int) -> str:
+    """A line for a narrow terminal; what does not fit goes on below, a little further in."""
+    return fill(line, LINE_WIDTH, initial_indent=" " * indent, subsequent_indent=" " * (indent + 2))
 
 
 def list_scene(name: str) -> Entry:
@@ -97,6 +99,7 @@ def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception 
     Yields each name when it is done, with the exception if it failed: the other scenes are drawn all the same.
     """
     from physjax.files import write_atomically
+    from physjax.show.pages import read_web_file
 
     cards: list[str] = []
     for name in names:
@@ -108,7 +111,7 @@ def render(names: Iterable[str], folder: Path) -> Iterator[tuple[str, Exception 
             cards.append(_render_card(Entry(name, title(name), "", f"could not be drawn: {reason}"), drawn=False))
         yield name, error
     with write_atomically(folder / "index.html") as file:
-        file.write(_PAGE.replace("__CARDS__", "\n".join(cards)))
+        file.write(_PAGE.replace("__COLORS__", read_web_file("colors.css")).replace("__CARDS__", "\n".join(cards)))
 
 
 def _draw_scene(name: str, folder: Path) -> Entry:
@@ -160,13 +163,15 @@ _PAGE = """<!doctype html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>physjax: the gallery</title>
 <style>
-body { font: 16px/1.45 system-ui, sans-serif; max-width: 1280px; margin: 1.5em auto; padding: 0 1em; color: #222; }
+__COLORS__body { color: var(--ink); background: var(--page); }
+body { font: 16px/1.45 system-ui, sans-serif; max-width: 1280px; margin: 1.5em auto; padding: 0 1em; }
 main { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 360px), 1fr)); gap: 1.5em; align-items: start; }
-article { border: 1px solid #ddd; border-radius: 8px; padding: 0 1em; overflow-wrap: break-word; }
+article { border: 1px solid var(--line); border-radius: 8px; padding: 0 1em; overflow-wrap: break-word; }
 h2 { font-size: 1.15em; margin: .7em 0; }
 button { display: block; width: 100%; padding: 0; border: 0; background: none; cursor: pointer; }
-img { display: block; width: 100%; height: 260px; object-fit: contain; }
-.small { font-size: .85em; color: #555; }
+img { display: block; width: 100%; height: 260px; object-fit: contain; border-radius: 4px; background: white; }
+:focus-visible { outline: 2px solid var(--accent); outline-offset: 2px; }
+.small { font-size: .85em; color: var(--pale); }
 </style>
 <h1>physjax: the gallery</h1>
 <p>Each scene, and the truths that it is tested against. Press a picture to play it.</p>

@@ -1,6 +1,7 @@
 """The gallery is listed and drawn from what its scenes are, and a scene that fails stops none of the others."""
 
 import functools
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from physjax import Particles, Scene, forces, lattices
 from physjax.cli import main
 from physjax.scenes import FAILURES, SCENES
 from physjax.scenes.catalogue import build_scene, describe_problem, list_scene
+from physjax.show.pages import read_web_file
 from physjax.study.problem import Problem, Truth
 
 
@@ -92,6 +94,10 @@ def test_every_scene_is_drawn_and_one_that_fails_is_named_at_the_end(tmp_path, c
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "://" not in page
     assert 'name="viewport"' in page
+    assert "prefers-color-scheme: dark" in page
+    style = re.search(r"<style>(.*?)</style>", page, re.S)[1].replace(read_web_file("colors.css"), "")
+    assert "background: var(--page)" in style
+    assert not re.search(r"#[0-9a-f]{3}\b", style), "every colour is one of the themes"
     assert all(f'<article id="{name}">' in page for name in SCENES)
     assert page.count("<img") == 2
     assert "keeps to its line [m]" in page
