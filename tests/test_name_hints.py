@@ -38,6 +38,11 @@ ARGUMENTS = {
     "restitution",
     "rows",
     "panels",
+    "angular_velocity",
+    "axis",
+    "coefficient",
+    "density",
+    "points",
 }
 
 
@@ -135,6 +140,12 @@ def test_a_wrong_argument_is_answered_too(monkeypatch):
         simulate(scene, methods.rk4, timestep=0.1, steps=3)
     with pytest.raises(TypeError, match=r"argument 'masses'\. Did you mean mass\? It takes state, mass="):
         Scene(scene.state, masses=2.0)
+    with pytest.raises(TypeError, match=r"argument 'spin'\. Did you mean angular_velocity\?"):
+        forces.SpinLift(radius=0.03, spin=3.0)
+    with pytest.raises(TypeError, match=r"argument 'spin'\. Did you mean axis\?"):
+        forces.Magnus(area=1.0, coefficient=1.0, spin=3.0)
+    with pytest.raises(TypeError, match=r"argument 'anchors'\. Did you mean points\?"):
+        rigid.Rods([(-1, 0)], anchors=[(0.0, 0.0)])
     with pytest.raises(TypeError, match=r"argument 'segments'\. Did you mean panels\?"):
         lattices.bridge(4.0, 0.5, segments=6, mass=1.0, stiffness=100.0)
 

@@ -53,6 +53,14 @@ def test_a_notebook_teaches(path):
     assert exercises.count("<details><summary>Answer</summary>") == exercises.count("</details>") == 3
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_figures_that_depend_on_a_machine_are_printed_by_cells(path):
+    """Prose that says how fast something is has no results file behind it."""
+    prose = "\n".join(cell.source for cell in nbformat.read(path, 4).cells if cell.cell_type == "markdown")
+    speed = r"\d[^.\n]*(million|billion|steps/s|times as fast|faster than|seconds on)"
+    assert not re.search(speed, prose), re.search(speed, prose)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_from_top_to_bottom(path, tmp_path, monkeypatch):
