@@ -139,7 +139,10 @@ MISTAKES = {
         lambda: Scene(BALL, force=()),
         r"keyword argument 'force'\. Did you mean forces\? It takes state, mass=, forces=",
     ),
-    "a keyword of a part that is none": (lambda: forces.SpinLift(spin=3.0), r"'spin'. It takes \w+"),
+    "a keyword of a part that is none": (
+        lambda: forces.SpinLift(spin=3.0),
+        r"'spin'\. Did you mean angular_velocity\? It takes \w+",
+    ),
     "a run without a method": (lambda: simulate(FALL), "It takes scene, method, dt"),
     "bodies without inertia": (
         lambda: Scene(rigid.planar_bodies(inertia.planar_disc(1.0, 0.5), [[0.0, 0.0]])),
