@@ -162,7 +162,7 @@ class Aimed(eqx.Module):
 @announce_compiling("aim_at")
 def aim_at(
     scene: Scene,
-    target: ArrayLike,
+    target: ArrayLike | Callable,
     *,
     speed: ArrayLike | None = None,
     bounces: int = 0,
@@ -177,7 +177,8 @@ def aim_at(
     found. The scene has one lane for all targets, or one for each. A flight is `steps` equal steps of the method;
     angle and flight time are solved for together, to the last digits, so that the error left is the method's own.
     From a launcher that moves at `launcher_velocity` [m/s], `(dim,)` or one for each shot, the speed is relative to it.
-    A target that moves at `target_velocity` [m/s], given likewise, is at `target` at the launch.
+    A target that moves at `target_velocity` [m/s], given likewise, is at `target` at the launch; one that moves otherwise
+    is a path, a function `(t) -> place` `(dim,)` of the time since then [s], the same for all shots.
     Contacts are obstacles, unless the target is to be hit after `bounces` impacts on them (`contacts.impact`). Then a
     fan of directions is tried: `low` is the soonest hit that it leads to, `high` the latest. A target out of reach gives
     `ok` False and the nearest miss. Works under `jit`, `vmap`, and any derivative with respect to the target, the speed
@@ -196,6 +197,9 @@ def aim_at(
         >>> running = aim_at(start, (5.0, 0.0), speed=9.9, target_velocity=(2.0, 0.0))
         >>> print(running.meeting_place(running.low).round(2))
         [6.37 0.  ]
+        >>> swinging = aim_at(start, lambda t: jnp.stack([5.0 + jnp.sin(3.0 * t), 0.5 * t]), speed=9.9)
+        >>> print(swinging.meeting_place(swinging.low).round(2))
+        [5.93 0.32]
     """
     shots = check_problem(scene, target, method, steps, launcher_velocity, target_velocity)
     bounces = check_bounces(bounces, speed, shots.scene)

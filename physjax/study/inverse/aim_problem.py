@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
@@ -32,7 +33,7 @@ def check_bounces(bounces: int, speed: ArrayLike | None, scene: Scene) -> int:
 
 def check_problem(
     scene: Scene,
-    target: ArrayLike,
+    target: ArrayLike | Callable,
     method: Callable[..., PyTree],
     steps: int,
     launcher: ArrayLike | None,
@@ -45,7 +46,12 @@ def check_problem(
         raise TypeError(f"aim_at: got the method {method!r}, expected a method of stepping, e.g. methods.rk4.")
     steps = as_positive_integer("steps", steps)
     _demand_free_shots(scene)
-    target, shape = _match_targets(scene, target)
+    if callable(target):
+        path = as_module(target)
+        start, target_velocity = _read_path(path, scene, target_velocity)
+    else:
+        path, start = None, target
+    target, shape = _match_targets(scene, start)
     position = jnp.broadcast_to(scene.state.position, shape)
     away = norm(target - position)
     known_away = concrete_or_none(away)
@@ -56,7 +62,21 @@ def check_problem(
         None if velocity is None else _spread_velocity(name, velocity, position)
         for name, velocity in (("launcher_velocity", launcher), ("target_velocity", target_velocity))
     )
-    return AimProblem(scene.replace(state=at_rest), target, as_module(method), steps, launcher, target_velocity)
+    return AimProblem(scene.replace(state=at_rest), target, as_module(method), steps, launcher, target_velocity, path)
+
+
+def _read_path(path: Callable, scene: Scene, target_velocity: ArrayLike | None) -> tuple[Array, Array]:
+    """Where a path starts [m] and how fast [m/s], or a ValueError where it is not that of one place."""
+    if target_velocity is not None:
+        raise ValueError("aim_at: got a path and target_velocity=, expected one of them: a path says how fast it is.")
+    start = jnp.zeros((), scene.state.dtype)
+    place, velocity = jax.jvp(lambda t: jnp.asarray(path(t)), (start,), (jnp.ones_like(start),))
+    if place.shape != scene.state.position.shape[-1:]:
+        raise ValueError(
+            f"target: got a path to places of shape {place.shape}, expected {scene.state.position.shape[-1:]}, a function of "
+            "the time since the launch, (t) -> place [m], the same for all shots."
+        )
+    return place, velocity
 
 
 def _demand_free_shots(scene: Scene) -> None:

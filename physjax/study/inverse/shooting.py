@@ -61,6 +61,7 @@ class AimProblem(eqx.Module):
     """Where shots are fired: a scene with a lane for every target [m], the method of the flights and their steps.
 
     `launcher` is the velocity of what they are fired from, `target_velocity` that of the targets [m/s]; None: at rest.
+    `path(t)` is where a target is that moves in any way; its `target_velocity` is then that at the launch.
     """
 
     scene: Scene = eqx.field(metadata=RECORD)
@@ -69,6 +70,7 @@ class AimProblem(eqx.Module):
     steps: int = eqx.field(static=True)
     launcher: Float[Array, "*lanes dim"] | None = eqx.field(metadata=RECORD, default=None)
     target_velocity: Float[Array, "*lanes dim"] | None = eqx.field(metadata=RECORD, default=None)
+    path: Callable | None = None
 
     @property
     def offset(self) -> Float[Array, "*lanes dim"]:
@@ -77,6 +79,8 @@ class AimProblem(eqx.Module):
 
     def target_at(self, time: Float[Array, "*lanes"]) -> Float[Array, "*lanes dim"]:
         """Where the targets are at a time after the launch [m]."""
+        if self.path is not None:
+            return jax.vmap(self.path)(time.reshape(-1)).astype(time.dtype).reshape(self.target.shape)
         return self.target if self.target_velocity is None else self.target + scale(time, self.target_velocity)
 
     @property

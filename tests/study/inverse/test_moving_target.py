@@ -1,9 +1,11 @@
 """Shots at what moves: the roots of the closed form, with linear drag too, derivatives, bounces and pictures."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 from scipy.optimize import brentq
 
 from physjax import Particles, Scene, aim_at, contacts, forces
@@ -82,3 +84,31 @@ def test_by_a_bounce_it_meets_a_target_too():
 def test_a_velocity_of_the_target_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match=r"target_velocity \[m/s\]: got shape \(3,\)"):
         aim_at(gun(2), (40.0, -6.0), speed=SPEED, target_velocity=(1.0, 2.0, 3.0))
+
+
+class Swing(eqx.Module):
+    """A target that swings and climbs."""
+
+    width: Array
+
+    def __call__(self, t):
+        return jnp.stack([40.0 + self.width * jnp.sin(2.0 * t), -6.0 + 0.5 * t**2])
+
+
+@pytest.mark.parametrize("launcher", [None, (3.0, 1.0)])
+def test_a_target_on_a_path_is_met_where_it_is_then_and_the_answer_has_gradients(launcher):
+    def aim(width):
+        return aim_at(gun(2), Swing(width), speed=SPEED, launcher_velocity=launcher, steps=20)
+
+    width, h = jnp.asarray(4.0), 1e-4
+    aimed = aim(width)
+    np.testing.assert_allclose(aimed.flight(aimed.low).position[-1], Swing(width)(aimed.low.time), rtol=0, atol=1e-9)
+    angle = lambda width: aim(width).low.angle  # noqa: E731
+    difference = (angle(width + h) - angle(width - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(angle)(width), difference, rtol=1e-6)
+    np.testing.assert_allclose(jax.jvp(angle, (width,), (1.0,))[1], difference, rtol=1e-6)
+
+
+def test_a_path_to_more_than_one_place_is_refused():
+    with pytest.raises(ValueError, match="target: got a path to places of shape"):
+        aim_at(gun(2), lambda t: jnp.zeros((3, 2)) + t, speed=SPEED)
