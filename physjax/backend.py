@@ -226,6 +226,16 @@ def materialise(t: ArrayLike, function: Callable[[], T]) -> T:
     return lax.optimization_barrier(function())
 
 
+def hide_constant(number: ArrayLike, step: Array) -> Array:
+    """A number as it is, of which on a CPU the compiler does not see that it is constant, in a loop whose counter is `step`.
+
+    What is materialised at a time step that is known while compiling, as under a user's jit, is not stored. The gradient of
+    ten steps of 1024 bodies in space under leapfrog takes 23 s so, and 19 ms with this.
+    """
+    number = jnp.asarray(number)
+    return jnp.where(step >= 0, number, jnp.zeros_like(number)) if on_cpu() else number
+
+
 def block_fusion(tree: T) -> T:
     """The arrays as they are; on a CPU what computes them is not fused with what reads them.
 

@@ -19,7 +19,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from physjax.backend import runs_as_kernel, split_compilation
+from physjax.backend import hide_constant, runs_as_kernel, split_compilation
 from physjax.checks import as_positive_integer, as_real_argument, as_real_quantity, concrete_or_none
 from physjax.closures import warn_of_recompilation
 from physjax.compiling import announce_compiling
@@ -108,8 +108,12 @@ def _run_steps(
     record: Callable | None,
     *,
     in_kernel: bool = False,
+    inside: bool = False,
 ) -> Trajectory:
-    """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop."""
+    """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop.
+
+    `inside` another program the compiler may know the numbers.
+    """
     dt, first_step = jnp.asarray(dt), jnp.asarray(first_step)  # of the host, where nothing is compiled
     arrays, still = eqx.partition(scene, scene.changing())
     clock = partial(time_at, dt=dt, dtype=scene.state.dtype)
@@ -118,7 +122,10 @@ def _run_steps(
         kept = eqx.filter(scene.replace(state=states), scene.changing())
         last = jax.tree.map(lambda leaf: leaf[-1], kept)
     else:
-        last, kept = _step_through(scene, method, dt, first_step, frames, save_every, record, in_kernel=in_kernel)
+        # what rotates stores its turns at the time step
+        hidden = inside and scene.state.rotates
+        options = dict(in_kernel=in_kernel, hidden=hidden)
+        last, kept = _step_through(scene, method, dt, first_step, frames, save_every, record, **options)
     first_kept = arrays if record is None else record(clock(first_step), scene.state)
     kept = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first_kept, kept)
     film = None if record is not None else eqx.combine(kept, still)
@@ -149,6 +156,7 @@ def _step_through(
     record: Callable | None,
     *,
     in_kernel: bool,
+    hidden: bool,
 ) -> tuple[PyTree, PyTree]:
     """What steps change of a scene, at the end and at every frame behind the first; or what is recorded there."""
     changing = scene.changing()
@@ -156,6 +164,7 @@ def _step_through(
     moving = Moving(arrays, start_memory(scene, method, first_step, dt))
 
     def step(i: Array, moving: Moving, still: PyTree, dt: Array) -> Moving:
+        dt = hide_constant(dt, i) if hidden else dt
         scene, memory = take_step(eqx.combine(moving.arrays, still), method, i, dt, moving.memory)
         return Moving(eqx.filter(scene, changing), memory)
 
@@ -175,7 +184,7 @@ def _step_through(
 
 RUN_STRUCTURE = ("frames", "save_every", "record")
 """What of a run is structure and not numbers."""
-_run_inside = jax.jit(_run_steps, static_argnames=RUN_STRUCTURE)
+_run_inside = jax.jit(partial(_run_steps, inside=True), static_argnames=RUN_STRUCTURE)
 
 
 @functools.cache

@@ -310,6 +310,16 @@ def test_lanes_and_one_by_one_agree_in_both_precisions(precision):
         np.testing.assert_allclose(a, b, rtol=0, atol=200 * precision.eps)
 
 
+def test_a_gradient_under_a_users_jit_computes_each_cosine_of_a_turn_once():
+    spins = np.random.default_rng(0).normal(size=(8, 3))
+    body = inertia.box(1.0, (1.0, 0.5, 0.3))
+    scene = Scene(rigid.bodies(body, jnp.zeros((8, 3)), angular_velocity=spins), body)
+    run = lambda state: simulate(scene.replace(state=state), methods.verlet, dt=0.01, steps=10).final_scene.state  # noqa: E731
+    gradient = jax.jit(jax.grad(lambda state: jnp.sum(run(state).orientation[..., 1])))
+    # forward and recomputed; each of its readers would compute it again where the time step is a constant: 134
+    assert gradient.lower(scene.state).compile().as_text().count(" cosine(") <= 8
+
+
 @pytest.mark.parametrize("method", [methods.verlet, methods.rk4])
 def test_gradients_through_a_free_turn_agree_with_differences(method):
     @jax.jit
