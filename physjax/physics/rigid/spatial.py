@@ -15,21 +15,22 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from physjax.backend import materialise
 from physjax.checks import NestedArrayLike, Vectors, as_real_array, as_real_quantity
 from physjax.loops import Time, time_for_part
 from physjax.particles import Particles, check_load_shape, sum_terms
 from physjax.parts import Force, Function
+from physjax.physics.rigid.free_rotation import (
+    apply_inverse_principal,
+    principal_frame,
+    rotate_freely,
+    turn_rate,
+)
 from physjax.physics.rigid.inertia import Inertia, check_quaternion
 from physjax.scene import loads
 from physjax.vectors import (
     broadcast_vector,
-    components,
-    conjugate_quaternion,
     cross,
     dot,
-    multiply_by_vector,
-    multiply_quaternions,
     rotate_components,
     rotate_vector,
     scale,
@@ -167,7 +168,7 @@ class RigidBodies(NamedTuple):
     def rate(self, wrench: WholeWrench, inertia: Inertia) -> "RigidBodies":
         """Time derivative: x' = p/m, q' = ½(0, ω)q, p' = F, L' = τ; on a pivot what follows from turning about it."""
         force, torque = wrench
-        turning = _orientation_rate(self, inertia)
+        turning = turn_rate(self.orientation, self.angular_momentum, inertia)
         if inertia.arm is None:
             return RigidBodies(scale(1 / inertia.mass, self.momentum), turning, force, torque)
         omega = angular_velocity(self, inertia)
@@ -188,7 +189,8 @@ class RigidBodies(NamedTuple):
     def drift(self, dt: ArrayLike, inertia: Inertia) -> "RigidBodies":
         """x += p/m dt, and free rotation for a time dt, both momenta untouched."""
         position = self.position + scale(dt, scale(1 / inertia.mass, self.momentum))
-        return self._replace(position=position, orientation=rotate_freely(self, inertia, dt)).on_pivot(inertia)
+        orientation = rotate_freely(self.orientation, self.angular_momentum, inertia, dt)
+        return self._replace(position=position, orientation=orientation).on_pivot(inertia)
 
     def hold_lanes(self, free: Float[Array, "*lanes"]) -> "RigidBodies":
         """The state with both momenta of held bodies (free = 0) set to zero."""
@@ -299,64 +301,7 @@ def angular_acceleration(
     return apply_inverse_inertia(bodies, inertia, torque - gyroscopic)
 
 
-def rotate_freely(bodies: RigidBodies, inertia: Inertia, dt: ArrayLike) -> Float[Array, "*lanes 4"]:
-    """The orientation after free rotation for a time dt [s] with L constant, to second order.
-
-    A symmetric splitting of the rotational energy Σ ½ℓᵢ²/Iᵢ, with ℓ the angular momentum in the body frame: each term
-    alone is a rotation about a principal axis, in closed form. They follow one another and back: half, half, whole, half,
-    half. Exactly reversible in time, and without drift of the energy (R. McLachlan 1993, S. Reich 1994) while no body turns
-    by more than 2 rad: beyond, the turns resonate. `leapfrog`, which drifts twice, half a step each, bears twice the step of
-    methods that drift once (`stability.limit`).
-    """
-    w, *v = _principal_frame(bodies, inertia)
-    spin = rotate_components(conjugate_quaternion([w, *v]), components(bodies.angular_momentum))
-    inverse = components(broadcast_vector(inertia.inverse, bodies.angular_momentum))
-    for i, share in ((0, 0.25), (1, 0.25), (2, 0.5), (1, 0.25), (0, 0.25)):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        # half the angle, by which a quaternion rotates; the vector takes the whole, by the double-angle formulas
-        c, s = _cosine_and_sine(scale(dt, share * inverse[i] * spin[i]), dt)
-        w, v[i], v[j], v[k] = w * c - v[i] * s, v[i] * c + w * s, v[j] * c + v[k] * s, v[k] * c - v[j] * s
-        cosine, sine = c * c - s * s, 2.0 * c * s
-        spin[j], spin[k] = cosine * spin[j] + sine * spin[k], cosine * spin[k] - sine * spin[j]
-    return _body_frame([w, *v], bodies, inertia)
-
-
-def _cosine_and_sine(angle: Array, dt: ArrayLike) -> tuple[Array, Array]:
-    """Cosine and sine [1] of an angle [rad], computed once: XLA on a CPU would repeat them for each of their readers."""
-    return materialise(dt, lambda: (jnp.cos(angle), jnp.sin(angle)))
-
-
-def _principal_frame(bodies: RigidBodies, inertia: Inertia) -> list[Array]:
-    """The quaternion from the principal axes to the world, in components."""
-    q = components(bodies.orientation)
-    if inertia.axes is None:
-        return q
-    return multiply_quaternions(q, components(broadcast_vector(inertia.axes, bodies.orientation)))
-
-
-def _body_frame(frame: list[Array], bodies: RigidBodies, inertia: Inertia) -> Array:
-    """The orientation of bodies whose principal axes have the quaternion `frame`: the inverse of `_principal_frame`."""
-    if inertia.axes is not None:
-        axes = components(broadcast_vector(inertia.axes, bodies.orientation))
-        frame = multiply_quaternions(frame, conjugate_quaternion(axes))
-    return stack_components(frame)
-
-
-def _orientation_rate(bodies: RigidBodies, inertia: Inertia) -> Array:
-    """q' = ½ q (0, ω) with ω in the body frame, which is cheaper than ½ (0, ω) q with ω in the world frame."""
-    frame = _principal_frame(bodies, inertia)
-    half = _apply_inverse_principal(frame, 0.5 * inertia.inverse, bodies.angular_momentum)
-    return _body_frame(multiply_by_vector(frame, half), bodies, inertia)
-
-
-def _apply_inverse_principal(frame: list[Array], inverse: Array, vector: Array) -> list[Array]:
-    """I⁻¹ Rᵀ times a vector of the world frame, in components along the principal axes."""
-    turned = rotate_components(conjugate_quaternion(frame), components(vector))
-    numbers = components(broadcast_vector(inverse, vector))
-    return [number * part for number, part in zip(numbers, turned, strict=True)]
-
-
 def apply_inverse_inertia(bodies: RigidBodies, inertia: Inertia, vector: Array) -> Array:
     """R I⁻¹ Rᵀ times a vector of the world frame: the change of ω by an angular impulse."""
-    frame = _principal_frame(bodies, inertia)
-    return stack_components(rotate_components(frame, _apply_inverse_principal(frame, inertia.inverse, vector)))
+    frame = principal_frame(bodies.orientation, inertia)
+    return stack_components(rotate_components(frame, apply_inverse_principal(frame, inertia.inverse, vector)))

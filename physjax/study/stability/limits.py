@@ -142,7 +142,7 @@ def limit(scene: Scene, method: Callable, at: State | None = None) -> Limit:
     limit is that of the forces alone, as many times longer. What touches is held implicitly, and sets no limit of its own.
 
     Of bodies in space only their spin is considered: the limit is the step beyond which some free body, that turns as far in
-    it, gains or loses more than a tenth of its energy in 4000 steps. Measured, that is 2 rad for what drifts whole steps
+    it, gains or loses more than a tenth of its energy in 4000 steps. Measured, that is 1.8 rad for what drifts whole steps
     (`verlet`, `semi_implicit_euler`), 3.6 for `leapfrog`, which drifts half steps, 0.36 for `rk4`, 0.2 for `tsit5`, 0.5 for
     `dopri8`; under `euler`, `midpoint` and `heun` the energy grows at any step. Bodies near a sphere or a steady spin bear
     more. Phases are another matter: they are off by much less than a turn only well below it.

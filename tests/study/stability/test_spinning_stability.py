@@ -34,6 +34,14 @@ def test_at_half_the_limit_free_bodies_keep_their_energy_and_at_twice_not_all_do
     assert not max(lost) < 1.0
 
 
+@pytest.mark.parametrize("name", ["semi_implicit_euler", "verlet", "leapfrog"])
+def test_what_drifts_turns_needles_coins_and_balls_exactly_at_any_step(name):
+    bodies = inertia.box(1.0, np.array([[2.0, 0.02, 0.02], [0.02, 1.0, 1.0], [1.0, 1.0, 1.0]]))
+    scene = spinning(bodies, np.array([[300.0, 20.0, 5.0], [100.0, 20.0, 5.0], [1.0, 2.0, 3.0]]))
+    whole, fine = (simulate(scene, methods.METHODS[name], dt=0.5 / n, steps=n).state.orientation[-1] for n in (30, 600))
+    np.testing.assert_allclose(whole, fine, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("method", [methods.euler, methods.midpoint])
 def test_no_step_is_stable_where_the_energy_grows_at_any(method):
     found = stability.limit(spinning(*NEEDLE), method)
