@@ -19,7 +19,7 @@ import measures
 from harness import print_progress
 from measures import Workload
 
-WORKLOADS = ("projectile", "bounce", "bodies", "sheet", "spin", "slide", "lorenz", "peer_scenes", "scaling")
+WORKLOADS = ("projectile", "bounce", "bodies", "sheet", "spin", "slide", "tower", "lorenz", "peer_scenes", "scaling")
 """In the order in which they run."""
 SAME = ("backend", "device", "processor", "cores_used", "system", "python", "versions", "XLA_FLAGS")
 """What of a machine makes a result comparable."""
