@@ -157,21 +157,7 @@ def _hold(
     Where bodies are joined, also what contacts have exerted on each in the mean [N, N m], `(freedoms, bodies, worlds)`.
     """
     mechanics, (start, mean, end, h), links = world.mechanics, way, world.links
-    if ahead is not None:
-        touching = ahead.touching
-    else:
-        touching = mechanics.find_contacts(world, start.place, t)
-        if links is not None:
-            touching, kept = _arrange(links.turns, touching, kept)
-    struck = held_apart = touching.contacts
-    if links is not None:
-        world = world.take_turns(links.turns)
-        struck = held_apart = mechanics.link(touching.contacts, links.take_impacts().spread)
-        if links.at_impacts is not None:
-            held_apart = mechanics.link(touching.contacts, links.spread)
-    recall = lambda: materialise(t, lambda: jax.vmap(mechanics.recall)(kept, held_apart))  # noqa: E731
-    held = recall() if ahead is None else ahead.held
-    touching = touching._replace(contacts=held_apart)
+    world, touching, struck, held = _begin(world, start, kept, ahead, t)
     push = sum_impulses(mechanics, touching.contacts, held, world.incidence, links)
     moved = mean, end
     if ahead is not None:
@@ -201,6 +187,26 @@ def _hold(
     exerted = map_components(jnp.add, hits, total)
     loads = sum_impulses(mechanics, mechanics.free(touching.contacts), exerted, world.incidence, None)
     return places, rates, links.turns.restore(kept), flatten(loads) / h[None]
+
+
+def _begin(
+    world: World, start: Pose, kept: Kept, ahead: _Ahead | None, t: ArrayLike
+) -> tuple[World, Touching, Any, Impulses]:
+    """The world as contacts are solved, these, the same as impacts find them, and the impulses with which they begin."""
+    mechanics, links = world.mechanics, world.links
+    touching = mechanics.find_contacts(world, start.place, t) if ahead is None else ahead.touching
+    struck = touching.contacts
+    if links is not None:
+        if ahead is None:
+            touching, kept = _arrange(links.turns, touching, kept)
+        world, contacts = world.take_turns(links.turns), touching.contacts
+        struck = mechanics.link(contacts, links.take_impacts().spread)
+        touching = touching._replace(
+            contacts=struck if links.at_impacts is None else mechanics.link(contacts, links.spread)
+        )
+    if ahead is not None:
+        return world, touching, struck, ahead.held
+    return world, touching, struck, materialise(t, lambda: jax.vmap(mechanics.recall)(kept, touching.contacts))
 
 
 def _arrange(turns: Turns, touching: Touching, kept: Kept) -> tuple[Touching, Kept]:
