@@ -227,10 +227,10 @@ def materialise(t: ArrayLike, function: Callable[[], T]) -> T:
 
 
 def hide_constant(number: ArrayLike, step: Array) -> Array:
-    """A number as it is, of which on a CPU the compiler does not see that it is constant, in a loop whose counter is `step`.
+    """The number, hidden on a CPU from the compiler's constant folding in a loop whose counter is `step`.
 
-    What is materialised at a time step that is known while compiling, as under a user's jit, is not stored. The gradient of
-    ten steps of 1024 bodies in space under leapfrog takes 23 s so, and 19 ms with this.
+    Under a user's jit the time step is a constant, the branches of `materialise` at it are folded away, and nothing is stored:
+    the gradient of ten steps of 1024 bodies in space under leapfrog then takes 23 s instead of 19 ms.
     """
     number = jnp.asarray(number)
     return jnp.where(step >= 0, number, jnp.zeros_like(number)) if on_cpu() else number

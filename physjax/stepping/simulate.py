@@ -112,7 +112,7 @@ def _run_steps(
 ) -> Trajectory:
     """The compiled run. Only the arrays that a step changes are carried; the others stay constants of the loop.
 
-    `inside` another program the compiler may know the numbers.
+    `inside`: part of another program, such as a user's jit, whose compiler may know dt.
     """
     dt, first_step = jnp.asarray(dt), jnp.asarray(first_step)  # of the host, where nothing is compiled
     arrays, still = eqx.partition(scene, scene.changing())

@@ -55,8 +55,8 @@ class Solids(Contact):
     is several bodies held together by `rigid.Welds`.
 
     Bodies in exact joints move as these let them where a contact pushes one of them: light wheels carry a heavy car, and what is
-    welded together bounces as one body. So do limits that are met and drives at their aim, which give way where contacts pull
-    or push too hard: known after a sub-step, and from impacts after the next.
+    welded together bounces as one body. Limits that are met and drives at their aim hold in the same way. Where a contact
+    pulls a joint off its limit or overpowers its drive, the joint gives way one sub-step later.
 
     It remembers the `impulses` of contacts, `(*worlds, numbers, groups, size)`, with which the next step begins, and where
     bodies are joined the `loads` of contacts on each of them in the mean of the last step, `(*worlds, bodies, 3 or 6)`, force [N]

@@ -108,7 +108,7 @@ class Links(NamedTuple):
 
 
 def plan_turns(scene: Scene, groups: Groups) -> Turns | None:
-    """The turns in which the contacts of a scene are solved; None without contacts, or joints that hold."""
+    """The turns in which the contacts of a scene are solved; None without contacts or exact joints."""
     pairs = tuple(pair for part in find_constraints(scene) for pair in part.pairs)
     if not pairs or not groups.is_contact.any():
         return None
@@ -134,7 +134,7 @@ def find_links(turns: Turns, scene: Scene, moved: Any, h: Array) -> Links:
 
 
 def _find_response(joined: np.ndarray, mechanism: Mechanism, mobility: Array, jacobian: Jacobian) -> Response:
-    """What the rows of a Jacobian, none of which may change, add where a contact alone changes velocities by 1."""
+    """What joints add where a contact alone changes velocities by 1, so that no row of the Jacobian changes."""
     matrix = mechanism.build_matrix(jacobian, mechanism.move_by_impulses(mobility, jacobian))
     freedoms, bodies = mechanism.coordinates.freedoms, len(mechanism.free)
     one = np.eye(freedoms * bodies).reshape(freedoms, bodies, freedoms, bodies)[:, joined]
